@@ -98,7 +98,6 @@ schemas: $(READY)  ## the JSON Schemas of the results, which ship with the packa
 
 pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
-	$(BIN)/python docs/side_by_side.py docs/images
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
 	$(BIN)/python docs/readme_figures.py docs/images
 

@@ -16,15 +16,22 @@ Run: python bench/analyse_hour.py [--minutes 60] [--runs 2] [--adaptive]
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
-from measuring import HERE, HOUR_S, PEAK_MIB, add_place, arguments, write_hour
+from measuring import (
+    HERE,
+    HOUR_S,
+    PEAK_MIB,
+    Took,
+    add_place,
+    arguments,
+    command_took,
+    hour_of,
+    in_turn,
+)  # fmt: skip
 from records import compared, verdict, versions
 
 MIB = 1 << 20
@@ -64,43 +71,17 @@ undulog.main()
 """
 
 
-class Cost(NamedTuple):
-    """Cost of a command.
-
-    Attributes:
-        wall_s: From start to exit.
-        processor_s: User and system time, all threads.
-        peak_mib: Largest resident memory.
-    """
-
-    wall_s: float
-    processor_s: float
-    peak_mib: float
-
-
-def cost(*words: str) -> Cost:
-    """Run ``undulog WORDS...`` and return its cost."""
-    start = time.perf_counter()
+def cost(*words: object) -> tuple[Took, float]:
+    """Run ``undulog WORDS...``; return its cost and its largest resident memory [MiB]."""
     with tempfile.NamedTemporaryFile() as peak:
-        command = [sys.executable, "-c", COMMAND, peak.name, *words]
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        _, status, usage = os.wait4(child.pid, 0)
-        took = time.perf_counter() - start
-        child.returncode = os.waitstatus_to_exitcode(status)
-        if child.returncode:
-            raise SystemExit(f"undulog {' '.join(words)} failed with exit code {child.returncode}")
-        peak_mib = float(Path(peak.name).read_text())
-    return Cost(took, usage.ru_utime + usage.ru_stime, peak_mib)
+        took = command_took(sys.executable, "-c", COMMAND, peak.name, *words)
+        return took, float(Path(peak.name).read_text())
 
 
-def spent_s(program: str, *words: str) -> float:
-    """Return the processor time of a Python program [s]."""
-    child = subprocess.Popen([sys.executable, "-c", program, *words], cwd=HERE)
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"the peer failed with exit code {child.returncode}")
-    return usage.ru_utime + usage.ru_stime
+def program_s(program: str, *words: object) -> float:
+    """Return the processor time of a Python program that imports from this folder [s]."""
+    command = [sys.executable, "-c", program, *words]
+    return command_took(*command, stdout=None, cwd=HERE).processor_s
 
 
 def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bool:
@@ -116,30 +97,29 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
     length = f"{part * 60:g} min{', adaptive' if adaptive else ''}"
     seconds = part * HOUR_S
     peer_s = min(PEER_S, seconds)
-    turns = [
-        (
-            cost("analyse", str(path)),
-            cost("report", str(path), "-o", str(page), "--force"),
-            spent_s(DECODE, str(path), str(peer_s)),
-            spent_s(READ, str(path)),
-        )
-        for _ in range(runs)
-    ]
-    analysed, reported, theirs, read = zip(*turns, strict=True)
+    analysed, reported, decoding, reading = in_turn(
+        runs,
+        partial(cost, "analyse", path),
+        partial(cost, "report", path, "-o", page, "--force"),
+        partial(program_s, DECODE, path, peer_s),
+        partial(program_s, READ, path),
+    )
     peer = f"{versions('mcap', 'mcap-ros2-support')} decoding the JointStates"
     if peer_s < seconds:
         peer += f" (scaled from {peer_s:g} s)"
     good: list[bool] = []
-    for verb, costs, bar in (("analyse", analysed, ANALYSE), ("report", reported, REPORT)):
+    for verb, costs, bar, bar_mib in (
+        ("analyse", analysed, ANALYSE, round(ANALYSE_MIB)),
+        ("report", reported, REPORT, None),
+    ):
         what = f"undulog {verb}, {length}"
-        ours = [one.processor_s for one in costs]
-        good.append(compared(what, ours, theirs, peer, bar=bar, scale=seconds / peer_s))
-        verdict(f"{what}, wall-clock time", min(one.wall_s for one in costs), None, "s")
-        peak = max(one.peak_mib for one in costs)
-        bar_mib = round(ANALYSE_MIB) if verb == "analyse" else None
-        good.append(verdict(f"{what}, peak memory", peak, bar_mib, "MiB"))
-    what, ours = f"undulog analyse, {length}", [one.processor_s for one in analysed]
-    good.append(compared(what, ours, read, "undulog reading its columns", bar=OF_READING))
+        took, peaks = zip(*costs, strict=True)
+        ours = [one.processor_s for one in took]
+        good.append(compared(what, ours, decoding, peer, bar=bar, scale=seconds / peer_s))
+        verdict(f"{what}, wall-clock time", min(one.wall_s for one in took), None, "s")
+        good.append(verdict(f"{what}, peak memory", max(peaks), bar_mib, "MiB"))
+    what, ours = f"undulog analyse, {length}", [one.processor_s for one, _ in analysed]
+    good.append(compared(what, ours, reading, "undulog reading its columns", bar=OF_READING))
     size = page.stat().st_size / MIB
     good.append(verdict(f"undulog report, {length}, page", size, round(PAGE_MIB, 2), "MiB"))
     return all(good)
@@ -147,19 +127,13 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
 
 def main() -> None:
     """Write, measure, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--runs", type=int, default=2)
+    parser = arguments(__doc__, minutes=60.0, runs=2)
     parser.add_argument("--adaptive", action="store_true", help="a gait that varies all the time")
     add_place(parser, "1 GB")
     options = parser.parse_args()
-    seconds = max(round(options.minutes * 60), 60)
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
-        if not path.exists():
-            write_hour(path, seconds, can=False, adaptive=options.adaptive)
+    with hour_of(options, adaptive=options.adaptive) as (path, seconds):
         good = measure(path, seconds / HOUR_S, options.runs, adaptive=options.adaptive)
-    sys.exit(0 if good else 1)
+    sys.exit(not good)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,12 @@ and controller states), each 40,000 messages at 100 Hz.
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from measuring import arguments
+from measuring import arguments, in_turn, took
 from records import compared, versions
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -95,20 +94,13 @@ def brought_in(bag: Path) -> None:
         import_bag(bag, Path(scratch, "session.mcap"))
 
 
-def seconds(work: Callable[[Path], None], bag: Path) -> float:
-    """Return the processor time of some work [s]."""
-    start = time.process_time()
-    work(bag)
-    return time.process_time() - start
-
-
 def measure(name: str, bag: Path, runs: int) -> bool:
     """Read and import one bag in turn; return whether the bar is met."""
-    works = (read, brought_in, decode)
-    for work in works:
-        work(bag)  # what is imported late is imported now
-    took = [[seconds(work, bag) for work in works] for _ in range(runs)]
-    opened, imported, peer = zip(*took, strict=True)
+    works = [partial(took, partial(work, bag)) for work in (read, brought_in, decode)]
+    in_turn(1, *works)  # what is imported late is imported now
+    opened, imported, peer = (
+        [each.processor_s for each in turns] for turns in in_turn(runs, *works)
+    )
     rosbags = versions("rosbags")
     compared(f"open and read a bag, {name}", opened, peer, rosbags)
     return compared(f"import a bag, {name}", imported, peer, rosbags, bar=BAR)
@@ -116,10 +108,8 @@ def measure(name: str, bag: Path, runs: int) -> bool:
 
 def main() -> int:
     """Measure one bag, or both that are written; return 1 if a bar is missed."""
-    parser = arguments(__doc__)
+    parser = arguments(__doc__, messages=40_000, runs=3)
     parser.add_argument("bag", type=Path, nargs="?")
-    parser.add_argument("--messages", type=int, default=40_000)
-    parser.add_argument("--runs", type=int, default=3)
     options = parser.parse_args()
     if options.bag is not None:
         return int(not measure(options.bag.name, options.bag, options.runs))

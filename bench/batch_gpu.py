@@ -12,42 +12,20 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
+from batch_twin import batch_took, servos_of
 from measuring import arguments, chain
 from numba import cuda
 from records import not_run, verdict
+from twin_step import without_sensors
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.sim import BatchRun, Scenario, load_scenario, run_batch
 from undulog.sim.batch.cuda import require_gpu
 
 JOINTS, WORLDS = (5, 25, 50), (1024, 4096, 16384)
-
-
-def servos_of(scenario: Scenario, worlds: int) -> list[Scenario]:
-    """Return the scenario with supplies from 5 V to 6 V."""
-    runs = list[Scenario]()
-    for k in range(worlds):
-        joints = tuple(
-            dataclasses.replace(one, servo=dataclasses.replace(one.servo, supply_v=5 + k / worlds))
-            for one in scenario.robot.joints
-        )
-        robot = dataclasses.replace(scenario.robot, joints=joints)
-        runs.append(dataclasses.replace(scenario, robot=robot))
-    return runs
-
-
-def run_s(scenario: Scenario, dtype: type[np.floating], device: str, worlds: int) -> float:
-    """Return wall time of a batch [s]."""
-    runs = servos_of(scenario, worlds)
-    start = time.monotonic()
-    done = run_batch(runs, dtype=dtype, device=device)
-    used = time.monotonic() - start
-    assert all(one.error is None for one in done), [str(one.error) for one in done]
-    return used
 
 
 def apart(scenario: Scenario) -> bool:
@@ -57,12 +35,9 @@ def apart(scenario: Scenario) -> bool:
     good = True
     for dtype, angles, gains in ((np.float64, 1e-6, 1e-5), (np.float32, 1e-3, 1e-3)):
         found = run_batch(runs, dtype=dtype, device="cuda")
-        far = max(
-            np.abs(a.angle - b.angle)[:101].max() for a, b in zip(found, expected, strict=True)
-        )
-        gain = max(
-            np.abs(swing(a) / swing(b) - 1).max() for a, b in zip(found, expected, strict=True)
-        )
+        pairs = list(zip(found, expected, strict=True))
+        far = max(np.abs(a.angle - b.angle)[:101].max() for a, b in pairs)
+        gain = max(np.abs(swing(a) / swing(b) - 1).max() for a, b in pairs)
         name = dtype.__name__
         good &= verdict(f"GPU to CPU: joint angles over 1 s, {name}", far / 0.4, angles, "")
         good &= verdict(f"GPU to CPU: gain over the last cycle, {name}", gain, gains, "")
@@ -79,16 +54,14 @@ def swing(run: BatchRun) -> FloatArray:
 
 def main() -> None:
     """Print the table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--seconds", type=float, default=2.0)
+    parser = arguments(__doc__, seconds=2.0)
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     options = parser.parse_args()
     if not Path("/proc/driver/nvidia/version").exists():
         not_run("a batch of the twin on a GPU", "no GPU")
         return
     require_gpu()
-    weak = load_scenario("weak-servo-pi3").changed(duration_s=options.seconds)
-    weak = dataclasses.replace(weak, sensing=dataclasses.replace(weak.sensing, enabled=False))
+    weak = without_sensors(load_scenario("weak-servo-pi3").changed(duration_s=options.seconds))
     failed = apart(weak)
     print(f"\n{cuda.get_current_device().name}, 1 kHz, {options.seconds:g} s")
     print(f"{'':<14}{'worlds':>7}{'joints':>7}{'wall s':>8}{'steps/s':>13}{'of a core':>11}")
@@ -97,7 +70,7 @@ def main() -> None:
         for dtype in (np.float64, np.float32):
             core = 0.0
             for device, worlds in (("cpu", 64), *(("cuda", one) for one in options.worlds)):
-                used = run_s(scenario, dtype, device, worlds)
+                used = batch_took(scenario, worlds, dtype, device).wall_s
                 rate = worlds * scenario.duration_s * scenario.physics_rate_hz / used
                 if device == "cpu":
                     core = rate

@@ -20,16 +20,15 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
 import mujoco
 import numpy as np
-from measuring import arguments, chain
+from measuring import Took, arguments, chain, took
 from mujoco import rollout
 from records import compared, verdict, versions
-from twin_step import step_builtin, step_twin, turns
+from twin_step import step_builtin, step_twin, turns, without_sensors
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane
@@ -46,8 +45,8 @@ ON_MUJOCO, ON_BULLET = "twin, numba + MuJoCo", "twin, numba + PyBullet"
 BUILT_IN = "PyBullet contacts + motors"
 
 
-def step_batch(scenario: Scenario, worlds: int, dtype: type[np.floating]) -> float:
-    """Return seconds of processor time a step of one world; the servos differ from run to run."""
+def servos_of(scenario: Scenario, worlds: int) -> list[Scenario]:
+    """Return the scenario with supplies from 5 V to 6 V."""
     runs: list[Scenario] = []
     for k in range(worlds):
         joints = tuple(
@@ -56,11 +55,23 @@ def step_batch(scenario: Scenario, worlds: int, dtype: type[np.floating]) -> flo
         )
         robot = dataclasses.replace(scenario.robot, joints=joints)
         runs.append(dataclasses.replace(scenario, robot=robot))
-    start = time.process_time()
-    done = run_batch(runs, dtype=dtype)
-    used = time.process_time() - start
+    return runs
+
+
+def batch_took(
+    scenario: Scenario, worlds: int, dtype: type[np.floating], device: str = "cpu"
+) -> Took:
+    """Return the cost of a batch; the servos differ from run to run."""
+    runs, done = servos_of(scenario, worlds), []
+    used = took(lambda: done.extend(run_batch(runs, dtype=dtype, device=device)))
     assert all(one.error is None for one in done), [str(one.error) for one in done]
-    return used / (worlds * scenario.duration_s * scenario.physics_rate_hz)
+    return used
+
+
+def step_batch(scenario: Scenario, worlds: int, dtype: type[np.floating]) -> float:
+    """Return seconds of processor time a step of one world."""
+    steps = worlds * scenario.duration_s * scenario.physics_rate_hz
+    return batch_took(scenario, worlds, dtype).processor_s / steps
 
 
 def step_rollout(scenario: Scenario, worlds: int, *, contacts: bool) -> float:
@@ -79,9 +90,9 @@ def step_rollout(scenario: Scenario, worlds: int, *, contacts: bool) -> float:
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     steps = round(scenario.duration_s * 1000)
     controls = np.zeros((worlds, steps, model.nu))
-    begun = time.process_time()
-    rollout.rollout(model, data, np.tile(state, (worlds, 1)), controls, nstep=steps)
-    return (time.process_time() - begun) / (worlds * steps)
+    start = np.tile(state, (worlds, 1))
+    used = took(partial(rollout.rollout, model, data, start, controls, nstep=steps))
+    return used.processor_s / (worlds * steps)
 
 
 def add_contacts(spec: mujoco.MjSpec, scenario: Scenario) -> None:
@@ -126,26 +137,22 @@ def agreement(scenario: Scenario) -> bool:
         for angle in (expected, double.angle, single.angle)
     ]
     apart = np.abs(double.angle - expected)[:101].max() / wave.amplitude
-    errors = [np.abs(one - found[0]).max() for one in found[1:]]
-    good = verdict(
-        "batch: joint angles over 1 s, of the amplitude", float(apart), 1e-6, "", peer=PEER
-    )
-    what = "batch: gain and lag over 5 s, float64"
-    good &= verdict(what, float(errors[0]), 1e-5, "", peer=PEER)
-    return not (
-        good
-        & verdict("batch: gain and lag over 5 s, float32", float(errors[1]), 1e-3, "", peer=PEER)
-    )
+    double_error, single_error = (float(np.abs(one - found[0]).max()) for one in found[1:])
+    good = [
+        verdict(f"batch: {what}", value, bar, "", peer=PEER)
+        for what, value, bar in (
+            ("joint angles over 1 s, of the amplitude", float(apart), 1e-6),
+            ("gain and lag over 5 s, float64", double_error, 1e-5),
+            ("gain and lag over 5 s, float32", single_error, 1e-3),
+        )
+    ]
+    return not all(good)
 
 
 def main() -> None:
     """Print the table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
-    weak = load_scenario("weak-servo-pi3").changed(duration_s=options.seconds)
-    weak = dataclasses.replace(weak, sensing=dataclasses.replace(weak.sensing, enabled=False))
+    options = arguments(__doc__, seconds=2.0, rounds=3).parse_args()
+    weak = without_sensors(load_scenario("weak-servo-pi3").changed(duration_s=options.seconds))
     for dtype in (np.float64, np.float32):
         run_batch([weak.changed(duration_s=0.1)], dtype=dtype)  # compiles, the first time
     step_twin(weak.changed(duration_s=0.05), Kernels.NUMBA)
@@ -170,12 +177,12 @@ def main() -> None:
                 step_rollout, scenario, 16, contacts=True
             ),
         }
-        took = turns(ways, options.rounds)
-        found = {way: min(costs) for way, costs in took.items()}
-        for (name, worlds), us in found.items():
+        found = turns(ways, options.rounds)
+        for (name, worlds), costs in found.items():
+            us = min(costs)
             print(f"{name:<38}{worlds:>7}{joints:>7}{us:>11.2f}{1e6 / us:>11,.0f}", flush=True)
         if joints == 25:
-            whole = took
+            whole = found
     batch, single = whole["batch, float64", 64], whole[ON_MUJOCO, 1]
     what = "step of 25 joints, batch of 64, float64"
     failed |= not compared(what, batch, single, f"single runs on {PEER}", bar=1 / 3, unit="us")

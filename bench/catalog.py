@@ -7,18 +7,19 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from mcap.reader import make_reader
+from measuring import arguments, in_turn, memory, took
 from records import compared, verdict, versions
 
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
@@ -59,24 +60,20 @@ def write(folder: Path, count: int) -> None:
             writer.set_verdict("good", [])
 
 
-def whole(paths: list[Path]) -> float:
-    """Time to read the columns of sessions, one by one [s]."""
-    start = time.perf_counter()
+def read_whole(paths: list[Path]) -> None:
+    """Read the columns of sessions, one by one."""
     for path in paths:
         with Session.open(path) as session:
             session.joints("/joint_states")
-    return time.perf_counter() - start
 
 
-def summaries_s(paths: list[Path]) -> float:
-    """Return the processor time of reading summaries and metadata by the MCAP library [s]."""
-    start = time.process_time()
+def read_summaries(paths: list[Path]) -> None:
+    """Read summaries and metadata by the MCAP library."""
     for path in paths:
         with path.open("rb") as stream:
             reader = make_reader(stream)
             reader.get_summary()
             list(reader.iter_metadata())
-    return time.process_time() - start
 
 
 def synthetic(folder: Path, count: int) -> Path:
@@ -90,32 +87,18 @@ def synthetic(folder: Path, count: int) -> Path:
         for start in range(0, count, step):
             numbers = range(start, min(start + step, count))
             lag_sd = rng.uniform(0.0, 0.1, len(numbers)).tolist()
+            scanned = {"scanned_ns": 1, "removed": False}
             sessions = [
-                {
-                    "path": f"lab/{k}.mcap",
-                    "head": f"lab/{k}.mcap",
-                    "session_id": f"s{k}",
-                    "robot": f"snake{5 + k % 3}",
-                    "part": 1,
-                    "scanned_ns": 1,
-                    "removed": False,
-                    "start_ns": EPOCH_NS + k,
-                    "duration_s": 4.0,
-                    "verdict": "good",
-                }
+                {"path": f"lab/{k}.mcap", "head": f"lab/{k}.mcap", "session_id": f"s{k}",
+                 "robot": f"snake{5 + k % 3}", "part": 1, "start_ns": EPOCH_NS + k,
+                 "duration_s": 4.0, "verdict": "good", **scanned}
                 for k in numbers
-            ]
+            ]  # fmt: skip
             analyses = [
-                {
-                    "source": f"lab/{k}.json",
-                    "session_id": f"s{k}",
-                    "lag_sd": value,
-                    "scanned_ns": 1,
-                    "removed": False,
-                    "answer": "unlike",
-                }
+                {"source": f"lab/{k}.json", "session_id": f"s{k}", "lag_sd": value,
+                 "answer": "unlike", **scanned}
                 for k, value in zip(numbers, lag_sd, strict=True)
-            ]
+            ]  # fmt: skip
             for kind, rows in (("sessions", sessions), ("analyses", analyses)):
                 store.write_table(f"{FOLDER}/{kind}/rows-{start}.parquet", table_of(kind, rows))
             for session, analysis in zip(sessions, analyses, strict=True):
@@ -129,7 +112,7 @@ def query(folder: str) -> tuple[float, int, float]:
     catalog.sql("select 1")  # imports
     start = time.perf_counter()
     rows = catalog.sql(f"select path, robot, start_ns, lag_sd from catalog where {WHERE}")
-    return time.perf_counter() - start, len(rows), _peak_mb()
+    return time.perf_counter() - start, len(rows), memory("VmHWM") / 1e6
 
 
 def peer(lines: str) -> tuple[float, int, float]:
@@ -137,7 +120,7 @@ def peer(lines: str) -> tuple[float, int, float]:
     start = time.perf_counter()
     frame = pd.read_json(lines, lines=True)
     rows = frame.query("robot == 'snake5' and lag_sd > 0.09")
-    return time.perf_counter() - start, len(rows), _peak_mb()
+    return time.perf_counter() - start, len(rows), memory("VmHWM") / 1e6
 
 
 def add(folder: str, writer: int) -> int:
@@ -146,23 +129,15 @@ def add(folder: str, writer: int) -> int:
     return writer
 
 
-def _peak_mb() -> float:
-    """Peak resident memory; that of getrusage counts the parent's, too [MB]."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
-
-
-def alone(function: object, *arguments: object) -> tuple[float, int, float]:
+def alone(function: object, place: str) -> tuple[float, int, float]:
     """Call a function in a fresh process."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()  # type: ignore[arg-type]
+        return pool.submit(function, place).result()  # type: ignore[arg-type]
 
 
 def main() -> None:
     """Run everything and judge it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("sessions", type=int, nargs="?", default=10_000)
     parser.add_argument("rows", type=int, nargs="?", default=1_000_000)
     parser.add_argument("--runs", type=int, default=3, help="of the query")
@@ -178,7 +153,8 @@ def main() -> None:
         again = Catalog(name).scan()
         rescan = time.process_time() - rescan
         paths = sorted(folder.rglob("*.mcap"))
-        summaries = summaries_s(paths)
+        summaries = took(partial(read_summaries, paths)).processor_s
+        whole = took(partial(read_whole, paths[:COMPARED])).wall_s
         scale = len(paths) / min(len(paths), COMPARED)
         print(f"{given.sessions} sessions: facts {first.wall_s:.1f} s, again {again.wall_s:.2f} s")
         size, peer_name = f"{given.sessions} sessions", f"{versions('mcap')}, summary and metadata"
@@ -191,7 +167,7 @@ def main() -> None:
                      peer_name, bar=AGAIN),
         ]  # fmt: skip
         compared(
-            f"catalog: facts of {size}", [used], [whole(paths[:COMPARED])],
+            f"catalog: facts of {size}", [used], [whole],
             f"reading the columns of each by undulog (scaled from {COMPARED})", scale=scale,
         )  # fmt: skip
         with ProcessPoolExecutor(WRITERS, get_context("spawn")) as pool:
@@ -206,12 +182,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="undulog-bench-") as name:
         lines = synthetic(Path(name), given.rows)
         Catalog(name).scan()  # puts the files together
-        turns = [(alone(query, name), alone(peer, str(lines))) for _ in range(given.runs)]
-        assert all(ours[1] == theirs[1] for ours, theirs in turns), "other rows were found"
+        turns = in_turn(given.runs, partial(alone, query, name), partial(alone, peer, str(lines)))
+        assert all(ours[1] == theirs[1] for ours, theirs in zip(*turns, strict=True)), (
+            "other rows were found"
+        )
         pandas = f"{versions('pandas')} over JSON lines"
         what = f"catalog: query of {given.rows} rows"
         for k, bar, unit, more in ((0, QUERY, "s", ""), (2, MEMORY, "MB", ", peak memory")):
-            costs = [[each[k] for each in side] for side in zip(*turns, strict=True)]
+            costs = [[each[k] for each in side] for side in turns]
             good.append(compared(what + more, *costs, pandas, bar=bar, unit=unit))
     sys.exit(not all(good))
 

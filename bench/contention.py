@@ -62,18 +62,18 @@ class Shares:
 
     def line(self) -> str:
         """Return one line of the table."""
-        late = "-" if self.late is None else f"{self.late / max(self.offered, 1):.3%}"
-        return (
-            f"{self.name:<46} {self.offered:>8} {self.refused / max(self.offered, 1):>8.3%} "
-            f"{self.start_refused:>6} {self.lost:>5} {late:>8} {self.worst_ms:>8.1f} "
-            f"{self.cpu:>6.1%}"
+        refused, late = (
+            "-" if count is None else f"{count / max(self.offered, 1):.3%}"
+            for count in (self.refused, self.late)
         )
+        return LINE.format(
+            self.name, self.offered, refused, self.start_refused, self.lost, late,
+            f"{self.worst_ms:.1f}", f"{self.cpu:.1%}",
+        )  # fmt: skip
 
 
-HEAD = (
-    f"{'recorder':<46} {'offered':>8} {'refused':>8} {'start':>6} {'lost':>5} {'> 5 ms':>8} "
-    f"{'worst/ms':>8} {'core':>6}"
-)
+LINE = "{:<46} {:>8} {:>8} {:>6} {:>5} {:>8} {:>8} {:>6}"
+HEAD = LINE.format("recorder", "offered", "refused", "start", "lost", "> 5 ms", "worst/ms", "core")
 
 
 @contextmanager
@@ -181,14 +181,10 @@ def judged(name: str, folder: Path, stamps: Sequence[dict[int, int] | int], cpu:
 
 
 def loaded(
-    stack: ExitStack,
-    kind: str,
-    places: Sequence[object],
-    folder: Path,
-    *size: float,
-) -> list[subprocess.Popen[str]]:
+    stack: ExitStack, kind: str, places: Sequence[object], folder: Path, *,
+    seconds: float, per_packet: int,
+) -> list[subprocess.Popen[str]]:  # fmt: skip
     """Start senders of real-time priority that note when each frame was taken."""
-    seconds, per_packet = size
     options = ("--fifo", "--rate", RATE, "--seconds", seconds, "--buffer", 0)
     options += ("--per-packet", per_packet, "--sent")
     return [
@@ -202,12 +198,13 @@ def undulog(kind: str, folder: Path, seconds: float, per_packet: int, *, granted
     places = [folder / f"{name}.sock" if kind == "unix" else 0 for name in BUSES]
     before = () if granted else REFUSED_PRIORITY
     with ExitStack() as stack:
+        load = partial(loaded, stack, kind, places, folder, seconds=seconds, per_packet=per_packet)
         if kind == "unix":
             recorder = start_undulog(stack, folder, sources_at(kind, places), *before)
             wait_for(places[1].exists)
-            senders = loaded(stack, kind, places, folder, seconds, per_packet)
+            senders = load()
         else:
-            senders = loaded(stack, kind, places, folder, seconds, per_packet)
+            senders = load()
             recorder = start_undulog(stack, folder, sources_at(kind, served(senders)), *before)
         stack.enter_context(contention(folder))
         cpu = waited(senders, recorder.pid)
@@ -232,7 +229,7 @@ def numbered(session: Session, name: str, sent: Path) -> dict[int, int]:
 def python_can(folder: Path, seconds: float) -> Shares:
     """python-can's own Logger on socketcand; it keeps the server's times, none of arrival."""
     with ExitStack() as stack:
-        senders = loaded(stack, "socketcand", (0, 0), folder, seconds, 1)
+        senders = loaded(stack, "socketcand", (0, 0), folder, seconds=seconds, per_packet=1)
         peer = start_peer(stack, "blf", folder, served(senders))
         stack.enter_context(contention(folder))
         cpu = waited(senders, peer.pid)
@@ -269,10 +266,9 @@ def judge(found: Sequence[Shares]) -> bool:
     good: list[bool] = []
     for name in dict.fromkeys(each.name for each in found if each.name != PYTHON_CAN):
         runs = [each for each in found if each.name == name]
-        offered = sum(each.offered for each in runs)
-        refused = 100 * sum(each.refused for each in runs) / offered
-        late = 100 * sum(each.late or 0 for each in runs) / offered
-        lost = sum(each.lost for each in runs)
+        counts = [(each.offered, each.refused, each.late or 0, each.lost) for each in runs]
+        offered, *shares, lost = np.sum(counts, axis=0).tolist()
+        refused, late = (100 * count / offered for count in shares)
         what = f"contention, {name}"
         good.append(verdict(f"{what}: accepted frames lost", lost, 0, "frames"))
         bar = 0.0 if "granted" in name else 0.5
@@ -291,9 +287,8 @@ def judge(found: Sequence[Shares]) -> bool:
 
 def main() -> None:
     """Run everything and judge it."""
-    parser = arguments(__doc__)
+    parser = arguments(__doc__, runs=3)
     parser.add_argument("seconds", type=float, nargs="?", default=6.0, help="of each run")
-    parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--only", default="", help="cases whose name has this text")
     parser.add_argument("--folder", type=Path, help="on the disk to be measured")
     args = parser.parse_args()

@@ -185,9 +185,7 @@ def chunk_sizes(payloads: list[bytes], folder: Path | None) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--messages", type=int, default=50_000)
-    parser.add_argument("--runs", type=int, default=3)
+    parser = arguments(__doc__, messages=50_000, runs=3)
     parser.add_argument("--folder", type=Path, help="a folder on the disk to measure")
     options = parser.parse_args()
     for size in SIZES:

@@ -152,10 +152,8 @@ def _judged(seed: int, wear: float, engine: str) -> tuple[bool, str, bool]:
 
 def main() -> None:
     """Print each fleet and the shares."""
-    parser = arguments(__doc__)
-    parser.add_argument("--seeds", type=int, default=50)
+    parser = arguments(__doc__, seeds=50, workers=2)
     parser.add_argument("--wear", type=float, default=0.15, help="share of the torque lost")
-    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--engine", default="bullet", help="bullet or mujoco")
     given = parser.parse_args()
     named = false = 0

@@ -132,8 +132,7 @@ def cost(arguments: list[str]) -> tuple[float, float]:
 
 def main() -> int:
     """Write, read, print; return 1 if any dimension costs more than it may."""
-    parser = arguments(__doc__)
-    parser.add_argument("--runs", type=int, default=3)
+    parser = arguments(__doc__, runs=3)
     parser.add_argument("dimensions", nargs="*", metavar="DIMENSION")
     options = parser.parse_args()
     worst = 0.0

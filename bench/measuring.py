@@ -8,9 +8,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, TypeVar
 
 from undulog.capture.robot.model import Robot
 
@@ -22,13 +24,54 @@ PEAK_MIB = 'int(open("/proc/self/status").read().partition("VmHWM:")[2].split()[
 Not ``ru_maxrss``, which in a child is at least what its parent had when it was started.
 """
 TICKS_S = os.sysconf("SC_CLK_TCK")
+_Figure = TypeVar("_Figure")
 
 
-def arguments(doc: str | None) -> argparse.ArgumentParser:
-    """Return a parser whose help is the docstring of the bench."""
-    return argparse.ArgumentParser(
+class Took(NamedTuple):
+    """Cost of some work.
+
+    Attributes:
+        wall_s: Wall-clock time.
+        processor_s: User and system time, all threads.
+    """
+
+    wall_s: float
+    processor_s: float
+
+
+def arguments(doc: str | None, **defaults: float) -> argparse.ArgumentParser:
+    """Return a parser with options that take a number; its help is the docstring of the bench."""
+    parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    for name, default in defaults.items():
+        parser.add_argument(f"--{name}", type=type(default), default=default)
+    return parser
+
+
+def took(work: Callable[[], object]) -> Took:
+    """Return the cost of some work; its result is dropped within that time."""
+    wall, processor = time.perf_counter(), time.process_time()
+    work()
+    return Took(time.perf_counter() - wall, time.process_time() - processor)
+
+
+def command_took(*command: object, **options: object) -> Took:
+    """Run a command to its end; return its cost, its children included."""
+    wall = time.perf_counter()
+    words = [str(word) for word in command]
+    process = subprocess.Popen(words, **{"stdout": subprocess.DEVNULL} | options)
+    _, status, used = os.wait4(process.pid, 0)
+    wall = time.perf_counter() - wall
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(words)} ended with exit code {process.returncode}")
+    return Took(wall, used.ru_utime + used.ru_stime)
+
+
+def in_turn(runs: int, *works: Callable[[], _Figure]) -> list[tuple[_Figure, ...]]:
+    """Return the figures of each work, turn by turn, so that a drift disturbs all alike."""
+    return list(zip(*([work() for work in works] for _ in range(runs)), strict=True))
 
 
 def start(stack: ExitStack, *command: object, **options: object) -> subprocess.Popen[str]:
@@ -51,6 +94,12 @@ def cpu_s(pid: int) -> float:
     """Return the processor time of a process, all its threads [s]."""
     parts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(parts[11]) + int(parts[12])) / TICKS_S
+
+
+def memory(figure: str, pid: int | str = "self") -> int:
+    """Return a figure of a process's memory, by its name in ``/proc/PID/status`` [byte]."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{figure}:"))
 
 
 def wait_for(condition: Callable[[], bool], pause_s: float = 0.01) -> None:
@@ -76,6 +125,19 @@ def add_place(parser: argparse.ArgumentParser, room: str) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--folder", type=Path, help=f"a folder with {room} to spare")
     place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+
+
+@contextmanager
+def hour_of(
+    options: argparse.Namespace, *, can: bool = False, adaptive: bool = False
+) -> Iterator[tuple[Path, int]]:
+    """Yield the session that the options place, written if need be, and its length [s]."""
+    seconds = max(round(options.minutes * 60), 60)
+    with TemporaryDirectory(dir=options.folder) as folder:
+        path = (options.keep or Path(folder) / "hour.mcap").resolve()
+        if not path.exists():
+            write_hour(path, seconds, can=can, adaptive=adaptive)
+        yield path, seconds
 
 
 def chain(robot: Robot, joints: int) -> Robot:

@@ -22,8 +22,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +32,7 @@ import zstandard
 from hour_session import BUS, EPOCH_NS, JOINT_TOPICS, write_session
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from measuring import HOUR_S, arguments
+from measuring import HOUR_S, arguments, in_turn, memory, took
 from records import compared, verdict, versions
 
 from undulog.capture import Session
@@ -63,17 +62,6 @@ def sensor_fields(session: Session) -> dict[str, list[str]]:
     return fields
 
 
-def took_s(work: Callable[[], object], clock: Callable[[], float]) -> float:
-    """Return the time of a piece of work [s]; its result is dropped within that time."""
-    start = clock()
-    work()
-    return clock() - start
-
-
-cpu_s = partial(took_s, clock=time.process_time)
-wall_s = partial(took_s, clock=time.perf_counter)
-
-
 def topics_loaded(path: Path) -> set[str]:
     """Return the topics that :func:`load` reads."""
     with Session.open(path) as session:
@@ -94,15 +82,17 @@ def inflate_s(path: Path, topics: Collection[str]) -> float:
         if not ids.isdisjoint(chunk.message_index_offsets)
     ]
     data = np.memmap(path, mode="r")
-    start = time.process_time()
-    decompressor = zstandard.ZstdDecompressor()
-    for at, size in places:
-        head = at + 9 + 8 + 8 + 8 + 4  # times, size, CRC; then the name of the compression
-        name = int.from_bytes(data[head : head + 4].tobytes(), "little")
-        begin = head + 4 + name
-        length = int.from_bytes(data[begin : begin + 8].tobytes(), "little")
-        decompressor.decompress(data[begin + 8 : begin + 8 + length], max_output_size=size)
-    return time.process_time() - start
+
+    def inflate() -> None:
+        decompressor = zstandard.ZstdDecompressor()
+        for at, size in places:
+            head = at + 9 + 8 + 8 + 8 + 4  # times, size, CRC; then the name of the compression
+            name = int.from_bytes(data[head : head + 4].tobytes(), "little")
+            begin = head + 4 + name
+            length = int.from_bytes(data[begin : begin + 8].tobytes(), "little")
+            decompressor.decompress(data[begin + 8 : begin + 8 + length], max_output_size=size)
+
+    return took(inflate).processor_s
 
 
 def load(path: Path, threads: int | None) -> Loaded:
@@ -137,12 +127,10 @@ def message_times(
         nonlocal read
         read = decode(path, topics, window)
 
-    took = [
-        [wall_s(partial(ours, number)) for number in threads] + [wall_s(peer)] for _ in range(runs)
-    ]
-    *each, theirs = zip(*took, strict=True)
-    ours_us = [[1e6 * seconds / count for seconds in times] for times in each]
-    return ours_us, [1e6 * seconds / read for seconds in theirs]
+    works = [*(partial(ours, number) for number in threads), peer]
+    *each, theirs = in_turn(runs, *(partial(took, work) for work in works))
+    ours_us = [[1e6 * one.wall_s / count for one in turns] for turns in each]
+    return ours_us, [1e6 * one.wall_s / read for one in theirs]
 
 
 def decode(path: Path, topics: Sequence[str], window: tuple[int, int]) -> int:
@@ -157,28 +145,29 @@ def decode(path: Path, topics: Sequence[str], window: tuple[int, int]) -> int:
 
 def window_ms(path: Path, start_s: int, threads: int) -> tuple[float, float]:
     """Return wall-clock times of the first and later windows of ten seconds [ms]."""
-    took: list[float] = []
+    found: list[float] = []
+    fields = {"/joint_states": ["position", "velocity", "effort"]}
     with Session.open(path, threads=threads) as session:
         for k in range(LATER_WINDOWS + 1):
             start_ns = EPOCH_NS + (start_s + 11 * k) * 10**9
             window = {"start_ns": start_ns, "stop_ns": start_ns + 10 * 10**9}
-            fields = {"/joint_states": ["position", "velocity", "effort"]}
-            took.append(wall_s(partial(session.joint_columns, fields, **window)) * 1e3)
-    return took[0], statistics.median(took[1:])
+            read = partial(session.joint_columns, fields, **window)
+            found.append(took(read).wall_s * 1e3)
+    return found[0], statistics.median(found[1:])
 
 
-def memory(path: Path) -> dict[str, int]:
+def loading_memory(path: Path) -> dict[str, int]:
     """Peak of a fresh process while it loads [byte]: beyond the arrays and the mapped file."""
     load_some = path.with_name("warm.mcap")
     write_session(load_some, 2, can=True)
     load(load_some, None)  # what is imported late is imported now
     load_some.unlink()
-    before, peak, done = _status("RssAnon"), 0, threading.Event()
+    before, peak, done = memory("RssAnon"), 0, threading.Event()
 
     def watch() -> None:  # what is mapped of the file is not in this figure
         nonlocal peak
         while not done.wait(0.001):
-            peak = max(peak, _status("RssAnon"))
+            peak = max(peak, memory("RssAnon"))
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -186,7 +175,7 @@ def memory(path: Path) -> dict[str, int]:
     done.set()
     watcher.join()
     arrays = sum(_sizes(found).values())
-    return {"arrays": arrays, "over": max(peak, _status("RssAnon")) - before - arrays}
+    return {"arrays": arrays, "over": max(peak, memory("RssAnon")) - before - arrays}
 
 
 def _sizes(found: Loaded) -> dict[int, int]:
@@ -196,12 +185,6 @@ def _sizes(found: Loaded) -> dict[int, int]:
     for table in tables.values():
         arrays += [one.to_numpy() for one in (table.index, *(table[name] for name in table))]
     return {array.ctypes.data: array.nbytes for array in arrays}
-
-
-def _status(key: str) -> int:
-    """Return a figure of this process's memory [byte]."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{key}:"))
 
 
 def make(path: Path, seconds: int, *, can: bool) -> None:
@@ -219,15 +202,12 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     ]
     loaded_topics = topics_loaded(path)
     load(path, 1)  # memory that was never used costs more the first time, file pages too
-    took = [
-        (
-            inflate_s(path, loaded_topics),
-            cpu_s(lambda: load(path, 1)),
-            cpu_s(lambda: load_frames(path)),
-        )
-        for _ in range(runs)
-    ]
-    reference, loaded, frames = zip(*took, strict=True)
+    reference, loaded, frames = in_turn(
+        runs,
+        partial(inflate_s, path, loaded_topics),
+        lambda: took(partial(load, path, 1)).processor_s,
+        lambda: took(partial(load_frames, path)).processor_s,
+    )
     peer = f"{versions('zstandard')}, decompressing the same chunks"
     what = "load joint, time, power and sensor columns, 1 thread"
     good.append(compared(what, loaded, reference, peer, bar=1.6))
@@ -241,14 +221,12 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     peer = versions("mcap", "mcap-ros2-support")
     begin = EPOCH_NS + seconds // 3 * 10**9
     ten = begin, begin + 10 * 10**9
-    windows = [
-        (
-            *window_ms(path, seconds // 3, threads),
-            1e3 * wall_s(partial(decode, path, ["/joint_states"], ten)),
-        )
-        for _ in range(runs)
-    ]
-    first, later, theirs = zip(*windows, strict=True)
+    windows, theirs = in_turn(
+        runs,
+        partial(window_ms, path, seconds // 3, threads),
+        lambda: 1e3 * took(partial(decode, path, ["/joint_states"], ten)).wall_s,
+    )
+    first, later = zip(*windows, strict=True)
     print(f"      first window of an open session: {statistics.median(first):.1f} ms")
     what = f"ten seconds of joint states, {threads} threads"
     good.append(compared(what, later, theirs, peer, bar=WINDOW_BAR, unit="ms"))
@@ -263,14 +241,12 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
 
 def main() -> None:
     """Write, measure, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--runs", type=int, default=3)
+    parser = arguments(__doc__, minutes=60.0, runs=3)
     parser.add_argument("--folder", type=Path, help="a folder with 2 GB to spare")
     parser.add_argument("--memory", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.memory is not None:
-        print(json.dumps(memory(options.memory)))
+        print(json.dumps(loading_memory(options.memory)))
         return
     seconds = max(round(options.minutes * 60), 60)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
@@ -278,7 +254,7 @@ def main() -> None:
         make(path, seconds, can=True)
         make(without, seconds, can=False)
         good = measure(path, without, seconds, options.runs)
-    sys.exit(0 if good else 1)
+    sys.exit(not good)
 
 
 if __name__ == "__main__":

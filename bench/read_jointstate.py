@@ -99,10 +99,7 @@ def timed(
 
 def main() -> None:
     """Write, read with each in turn, compare, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--runs", type=int, default=3)
-    options = parser.parse_args()
+    options = arguments(__doc__, minutes=5.0, runs=3).parse_args()
     threads = threads_or_default(None)
     peer = versions("mcap", "mcap-ros2-support")
     readers: dict[str, Callable[[Path], dict[str, FloatArray]]] = {

@@ -12,7 +12,6 @@ sent more than 20 ms late counts as lost. In the end the same beside busy loops 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -35,7 +34,7 @@ from contention import (
     start_sender,
     start_undulog,
 )
-from measuring import arguments, cpu_s, start, wait_for
+from measuring import arguments, cpu_s, memory, start, wait_for
 from records import compared, verdict, versions
 
 from undulog.capture import Session
@@ -73,21 +72,16 @@ class Outcome:
         """Return one line of the table."""
         rss = f"{self.rss_mb[0]:.0f} -> {self.rss_mb[-1]:.0f}" if self.rss_mb else "-"
         tick = f"{self.tick_p99_ms:.2f}" if self.tick_p99_ms is not None else "-"
-        return (
-            f"{self.name:<34} {self.offered:>9} {self.lost:>8} {self.cpu:>7.1%} {rss:>12} "
-            f"{self.size / 1e6:>8.1f} {tick:>8} {self.worst_behind_ms:>9.1f}"
-        )
+        return LINE.format(
+            self.name, self.offered, self.lost, f"{self.cpu:.1%}", rss, f"{self.size / 1e6:.1f}",
+            tick, f"{self.worst_behind_ms:.1f}",
+        )  # fmt: skip
 
 
-HEAD = (
-    f"{'recorder':<34} {'offered':>9} {'lost':>8} {'core':>7} {'RSS/MB':>12} {'file/MB':>8} "
-    f"{'p99/ms':>8} {'behind/ms':>9}"
+LINE = "{:<34} {:>9} {:>8} {:>7} {:>12} {:>8} {:>8} {:>9}"
+HEAD = LINE.format(
+    "recorder", "offered", "lost", "core", "RSS/MB", "file/MB", "p99/ms", "behind/ms"
 )
-
-
-def rss_mb(pid: int) -> float:
-    """Return resident memory [MB]."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.Popen[str]]) -> None:
@@ -96,7 +90,7 @@ def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.P
     begun, used = time.monotonic(), cpu_s(pid)
     while time.monotonic() < begun + seconds - SETTLE_S - 2:
         time.sleep(1.0)
-        outcome.rss_mb.append(rss_mb(pid))
+        outcome.rss_mb.append(memory("VmRSS", pid) / 1e6)
     outcome.cpu = (cpu_s(pid) - used) / (time.monotonic() - begun)
     for sender in senders:
         text, _ = sender.communicate(timeout=60)

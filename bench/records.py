@@ -10,7 +10,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -76,11 +76,8 @@ def verdict(
         most: Whether the bar is an upper one.
         peer: Where the bar comes from, if another program or a document sets it.
     """
-    met = None if bar is None else bool(value <= bar if most else value >= bar)
-    keep(Record(what=what, value=value, unit=unit, bar=bar, most=most, met=met, peer=peer))
-    figure = f"{value:.4g} {unit}".rstrip()
-    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, unit, most=most)}", flush=True)
-    return met is not False
+    record = Record(what=what, value=value, unit=unit, bar=bar, most=most, peer=peer)
+    return _judged(record, f"{value:.4g} {unit}".rstrip())
 
 
 def compared(
@@ -106,18 +103,13 @@ def compared(
     """
     peers = [scale * cost for cost in theirs]
     ratio, low, high = ratio_of(ours, peers)
-    met = None if bar is None else ratio <= bar
-    keep(
-        Record(
-            what=what, value=ratio, low=low, high=high, ours=tuple(ours), theirs=tuple(peers),
-            cost_unit=unit, peer=peer, bar=bar, met=met,
-        )
+    record = Record(
+        what=what, value=ratio, low=low, high=high, ours=tuple(ours), theirs=tuple(peers),
+        cost_unit=unit, peer=peer, bar=bar,
     )  # fmt: skip
     interval = "" if low is None else f" ({low:.3g} to {high:.3g})"
     mine, other = (f"{np.median(costs):.4g} {unit}" for costs in (ours, peers))
-    figure = f"{ratio:.3g}{interval} times {peer}, {mine} and {other}"
-    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, '', most=True)}", flush=True)
-    return met is not False
+    return _judged(record, f"{ratio:.3g}{interval} times {peer}, {mine} and {other}")
 
 
 def ratio_of(
@@ -146,11 +138,14 @@ def versions(*distributions: str) -> str:
     return " + ".join(f"{name} {version(name)}" for name in distributions)
 
 
-def _word(met: bool | None) -> str:
-    return {True: "PASS", False: "FAIL", None: "    "}[met]
-
-
-def _with_bar(figure: str, bar: float | None, unit: str, *, most: bool) -> str:
-    if bar is None:
-        return figure
-    return f"{figure} (bar: at {'most' if most else 'least'} {f'{bar:g} {unit}'.rstrip()})"
+def _judged(record: Record, figure: str) -> bool:
+    """Judge, keep and print a record; return whether its bar is met."""
+    word, bar, met = "    ", record.bar, None
+    if bar is not None:
+        met = bool(record.value <= bar if record.most else record.value >= bar)
+        word = "PASS" if met else "FAIL"
+        limit = f"{bar:g} {record.unit}".rstrip()
+        figure += f" (bar: at {'most' if record.most else 'least'} {limit})"
+    keep(replace(record, met=met))
+    print(f"{word}  {record.what}: {figure}", flush=True)
+    return met is not False

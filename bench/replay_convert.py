@@ -19,18 +19,24 @@ Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--can] [--rows 20
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-import tempfile
-import time
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 from analyse_hour import cost
-from measuring import PEAK_MIB, add_place, arguments, write_hour
+from measuring import (
+    PEAK_MIB,
+    add_place,
+    arguments,
+    command_took,
+    hour_of,
+    in_turn,
+    took,
+)  # fmt: skip
 from records import compared, verdict, versions
 
 from undulog.capture import Session
@@ -83,20 +89,14 @@ def converted(session: Path, recording: Path) -> Figures:
 
 def converted_by_command(session: Path, recording: Path) -> Figures:
     """Convert by the command line, which analyses first."""
-    took = cost("view", str(session), "--save", str(recording), "--force")
-    peak_mb = took.peak_mib * (1 << 20) / 1e6
-    return Figures(took.wall_s, took.processor_s, peak_mb, recording.stat().st_size / 1e6)
+    spent, peak_mib = cost("view", session, "--save", recording, "--force")
+    return Figures(*spent, peak_mib * (1 << 20) / 1e6, recording.stat().st_size / 1e6)
 
 
 def rerun_itself(path: Path, recording: Path) -> float:
     """Convert the MCAP file by Rerun's own reader; return the processor time [s]."""
     command = [viewer_binary(), "mcap", "convert", path, "-o", recording]
-    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, used = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"rerun mcap convert ended with exit code {child.returncode}")
-    return used.ru_utime + used.ru_stime
+    return command_took(*command, stderr=subprocess.DEVNULL).processor_s
 
 
 def row_by_row(path: Path, seconds: float, recording: Path) -> Figures:
@@ -132,21 +132,23 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> Figures:
         rec.set_time("session_time", duration=np.timedelta64(t_ns - start_ns, "ns"))
         rec.set_time("gait_cycle", duration=np.timedelta64((t_ns - start_ns) // 2, "ns"))
 
-    start, used = time.perf_counter(), time.process_time()
-    for t_ns, entity, value in samples:
-        stand_at(t_ns)
-        rec.log(entity, rr.Scalars(value))
-    for i, t_ns in enumerate(motion.t_ns.tolist()):
-        stand_at(t_ns)
-        for entity, place, way in (
-            ("/world/measured", origin[i], turn[i]),
-            ("/world/commanded", asked_origin[i], asked_turn[i]),
-        ):
-            shape = rr.Capsules3D(lengths=lengths, radii=radii, translations=place, quaternions=way)
-            rec.log(entity, shape)
-    rec.disconnect()
-    took_s, used_s = time.perf_counter() - start, time.process_time() - used
-    return Figures(took_s, used_s, 0.0, recording.stat().st_size / 1e6)
+    def log() -> None:
+        for t_ns, entity, value in samples:
+            stand_at(t_ns)
+            rec.log(entity, rr.Scalars(value))
+        for i, t_ns in enumerate(motion.t_ns.tolist()):
+            stand_at(t_ns)
+            for entity, at, way in (
+                ("/world/measured", origin[i], turn[i]),
+                ("/world/commanded", asked_origin[i], asked_turn[i]),
+            ):
+                shape = rr.Capsules3D(
+                    lengths=lengths, radii=radii, translations=at, quaternions=way
+                )
+                rec.log(entity, shape)
+        rec.disconnect()
+
+    return Figures(*took(log), 0.0, recording.stat().st_size / 1e6)
 
 
 def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
@@ -154,16 +156,13 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
     recording = path.with_name("bench.rrd")
     print(f"{minutes:g} min, 25 joints at 100 Hz, {path.stat().st_size / 1e6:.0f} MB of MCAP")
     scale = minutes * 60 / rows_s
-    turns = [
-        (
-            converted(path, recording),
-            converted_by_command(path, recording),
-            row_by_row(path, rows_s, recording),
-            rerun_itself(path, recording),
-        )
-        for _ in range(runs)
-    ]
-    ours, commands, rows, itself = zip(*turns, strict=True)
+    ours, commands, rows, itself = in_turn(
+        runs,
+        partial(converted, path, recording),
+        partial(converted_by_command, path, recording),
+        partial(row_by_row, path, rows_s, recording),
+        partial(rerun_itself, path, recording),
+    )
     rerun = versions("rerun-sdk")
     by_row = f"{rerun}, a log call for each sample (scaled from {rows_s:g} s)"
     own = f"{rerun} mcap convert of the MCAP, nothing derived"
@@ -187,20 +186,14 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
 
 def main() -> None:
     """Write, measure, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--runs", type=int, default=2)
+    parser = arguments(__doc__, minutes=60.0, runs=2)
     parser.add_argument("--can", action="store_true", help="with raw frames, 8,000 a second")
     parser.add_argument("--rows", type=float, default=20.0, help="what the peer takes [s]")
     add_place(parser, "2 GB")
     options = parser.parse_args()
-    seconds = max(round(options.minutes * 60), 60)
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
-        if not path.exists():
-            write_hour(path, seconds, can=options.can)
+    with hour_of(options, can=options.can) as (path, seconds):
         good = measure(path, seconds / 60, options.runs, options.rows)
-    sys.exit(0 if good else 1)
+    sys.exit(not good)
 
 
 if __name__ == "__main__":

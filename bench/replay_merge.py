@@ -25,6 +25,7 @@ from pathlib import Path
 
 import rerun as rr
 from hour_session import write_session
+from measuring import in_turn
 from records import compared, verdict, versions
 from rerun.chunk import Chunk, LazyChunkStream
 
@@ -74,13 +75,13 @@ def all_cpu_s() -> float:
     return used.user + used.system + used.children_user + used.children_system
 
 
-def timed(what: str, work: Callable[[], object], target: Path) -> tuple[float, float]:
-    """Run it; print and return how long it took: wall clock and CPU [s]."""
+def timed(what: str, work: Callable[[], object], target: Path) -> float:
+    """Run it; print how long it took and return the processor time [s]."""
     wall, cpu = time.perf_counter(), all_cpu_s()
     work()
     wall, cpu = time.perf_counter() - wall, all_cpu_s() - cpu
     print(f"{what}: {wall:.2f} s, {cpu:.2f} s of CPU, {target.stat().st_size / 1e6:.0f} MB")
-    return wall, cpu
+    return cpu
 
 
 def convert_both(folder: Path, minutes: float) -> list[Converted]:
@@ -114,28 +115,26 @@ def main(minutes: float) -> None:
         own = folder / "own.rrd"
         command = [viewer_binary(), "rrd", "merge", *recordings, "-o", own]
         merge_by_rerun = partial(subprocess.run, command, check=True, capture_output=True)
-        turns = [
-            (timed("merge", merge, target), timed("rerun rrd merge", merge_by_rerun, own))
-            for _ in range(3)
-        ]
+        ours, theirs = in_turn(
+            3,
+            partial(timed, "merge", merge, target),
+            partial(timed, "rerun rrd merge", merge_by_rerun, own),
+        )
         subprocess.run([viewer_binary(), "rrd", "verify", target], check=True, capture_output=True)
         overlay = partial(write_overlay, converted, target, Align.PHASE)
         title = "merge with views, differences and comparison"
         whole = [timed(title, overlay, target) for _ in range(3)]
         part = folder / "rows.rrd"
-        _, slow = timed(
+        slow = timed(
             f"row by row, every {PART}th row",
             lambda: write(part, lambda rec: rec.send_chunks(some_rows(streams(recordings)))),
             part,
         )
-        ours, theirs = ([cpu for _, cpu in each] for each in zip(*turns, strict=True))
         rerun = versions("rerun-sdk")
         what = f"merge two recordings of {minutes:g} min"
         good = compared(what, ours, theirs, f"{rerun}, rrd merge", bar=BAR)
         compared(what, [min(ours)], [slow], f"{rerun}, row by row (scaled)", scale=PART)
-        compared(
-            f"{what}, with differences", [cpu for _, cpu in whole], theirs, f"{rerun}, rrd merge"
-        )
+        compared(f"{what}, with differences", whole, theirs, f"{rerun}, rrd merge")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         verdict(f"{what}, peak memory of all of it", peak, None, "MB")
         sys.exit(not good)

@@ -163,9 +163,8 @@ def delays_s(packets: list[bytes]) -> np.ndarray[tuple[int], np.dtype[np.float64
 
 def main() -> None:
     """Print both tables."""
-    parser = arguments(__doc__)
+    parser = arguments(__doc__, runs=3)
     parser.add_argument("--frames", type=int, default=20_000, help="packets")
-    parser.add_argument("--runs", type=int, default=3)
     args = parser.parse_args()
     for protocol in ("feetech", "dynamixel2"):
         packets = stream(protocol, args.frames)

@@ -32,15 +32,8 @@ from pathlib import Path
 
 import numpy as np
 from bus_sender import cycle_frames
-from contention import (
-    BUSES,
-    REFUSED_PRIORITY,
-    ended,
-    sources_at,
-    start_sender,
-    start_undulog,
-)
-from measuring import HERE, arguments, cpu_s, start, wait_for
+from contention import BUSES, REFUSED_PRIORITY, ended, sources_at, start_sender, start_undulog
+from measuring import HERE, arguments, cpu_s, memory, start, wait_for
 from records import not_run, verdict
 
 from undulog.capture import Session
@@ -117,18 +110,18 @@ class Outcome:
 
     def line(self) -> str:
         """Return one line of the table."""
-        return (
-            f"{2 * self.load:>8.0f} {self.offered:>9} {self.refused:>8} {self.lost:>6} "
-            f"{self.late:>6} {self.undecoded:>9} {self.cpu_us:>9.1f} {self.share:>7.1%} "
-            f"{self.peak_mb:>6.0f} {self.written:>9.1f} {self.stored:>8.1f} "
-            f"{self.tick_p99_ms:>7.1f}"
-        )
+        return LINE.format(
+            f"{2 * self.load:.0f}", self.offered, self.refused, self.lost, self.late,
+            self.undecoded, f"{self.cpu_us:.1f}", f"{self.share:.1%}", f"{self.peak_mb:.0f}",
+            f"{self.written:.1f}", f"{self.stored:.1f}", f"{self.tick_p99_ms:.1f}",
+        )  # fmt: skip
 
 
-HEAD = (
-    f"{'frames/s':>8} {'offered':>9} {'refused':>8} {'lost':>6} {'late':>6} {'undecoded':>9} "
-    f"{'us/frame':>9} {'core':>7} {'MB':>6} {'written/B':>9} {'file/B':>8} {'p99/ms':>7}"
-)
+LINE = "{:>8} {:>9} {:>8} {:>6} {:>6} {:>9} {:>9} {:>7} {:>6} {:>9} {:>8} {:>7}"
+HEAD = LINE.format(
+    "frames/s", "offered", "refused", "lost", "late", "undecoded", "us/frame", "core", "MB",
+    "written/B", "file/B", "p99/ms",
+)  # fmt: skip
 
 
 @contextmanager
@@ -225,7 +218,7 @@ def run(folder: Path, load: float, seconds: float, before: Sequence[str]) -> Out
         outcome.share = used / (time.monotonic() - begun)
         outcome.cpu_us = used / accepted * 1e6
         outcome.written = (_written(pid) - written) / accepted
-        outcome.peak_mb = _status_mb(pid, "VmHWM")
+        outcome.peak_mb = memory("VmHWM", pid) / 1e6
         report = json.loads(ended(recorder, 2.0))
     outcome.tick_p99_ms = float(report["recorder"]["tick_p99_s"]) * 1e3
     outcome.stored = (folder / "run.mcap").stat().st_size / accepted
@@ -240,11 +233,6 @@ def _written(pid: int) -> int:
     lines = Path(f"/proc/{pid}/io").read_text().splitlines()
     figures = {key: int(value) for key, _, value in (line.partition(": ") for line in lines)}
     return figures["write_bytes"] - figures["cancelled_write_bytes"]
-
-
-def _status_mb(pid: int, key: str) -> float:
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:")) * 1.024e-3
 
 
 def judge(outcomes: Sequence[Outcome], seconds: float, where: str) -> bool:

@@ -36,6 +36,7 @@ from records import compared, versions
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
 from undulog.capture.sources.contract import SourceContext, open_source, parse_address
+from undulog.sim.serve.socketcand_protocol import frame_text
 
 TICK_S = 0.005
 STREAM_S = 60.0
@@ -56,20 +57,6 @@ def slcan_text(count: int) -> bytes:
     """Return the frames as an adapter sends them."""
     return b"".join(
         b"t%03X8%s\r" % (frame["id_flags"], bytes(frame["data"]).hex().upper().encode())
-        for frame in traffic(count)
-    )
-
-
-def socketcand_text(count: int) -> bytes:
-    """Return the frames as a server sends them."""
-    return b"".join(
-        b"< frame %03X %d.%06d %s >"
-        % (
-            frame["id_flags"],
-            frame["t_device_ns"] // 10**9,
-            frame["t_device_ns"] % 10**9 // 1000,
-            bytes(frame["data"]).hex().upper().encode(),
-        )
         for frame in traffic(count)
     )
 
@@ -113,7 +100,7 @@ def server(ready: Any, count: int, rate: float) -> None:
     """A socketcand server that sends its frames to each client."""
     listener = socket.create_server(("127.0.0.1", 0))
     ready.send(listener.getsockname()[1])
-    text = socketcand_text(count)
+    text = frame_text(traffic(count))
     while True:
         client, _ = listener.accept()
         client.sendall(b"< hi >")
@@ -228,11 +215,7 @@ def virtual(count: int, context: SourceContext) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--frames", type=int, default=20_000)
-    parser.add_argument("--runs", type=int, default=2)
-    parser.add_argument("--rate", type=float, default=8000.0)
-    given = parser.parse_args()
+    given = arguments(__doc__, frames=20_000, runs=2, rate=8000.0).parse_args()
     count, rate = given.frames, given.rate
     can.set_logging_level("error")  # it warns of each message that two reads share
     rows: dict[str, list[tuple[float, float | None]]] = defaultdict(list)

@@ -11,34 +11,18 @@ Run: python bench/starting.py [--runs 5]
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
-from measuring import arguments
+from measuring import arguments, command_took, in_turn
 from records import compared, versions
 
 import undulog
 from undulog.capture import SessionWriter
 
 HELP, INFO = 2.0, 3.0
-
-
-def processor_s(bytecode: str, *command: str) -> float:
-    """Return the processor time of a command, its children included [s].
-
-    Args:
-        bytecode: Folder of compiled modules.
-        command: Arguments of Python.
-    """
-    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": bytecode}
-    child = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL, env=env)
-    _, status, used = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"{' '.join(command)} ended with exit code {child.returncode}")
-    return used.ru_utime + used.ru_stime
 
 
 def write_session(path: Path) -> None:
@@ -52,34 +36,27 @@ def write_session(path: Path) -> None:
 
 def main() -> int:
     """Start all in turn, print; return 1 if a bar is missed."""
-    parser = arguments(__doc__)
-    parser.add_argument("--runs", type=int, default=5)
-    runs: int = parser.parse_args().runs
+    runs: int = arguments(__doc__, runs=5).parse_args().runs
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "small.mcap"
-        bytecode = f"{folder}/bytecode"
+        bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": f"{folder}/bytecode"}
+        start = partial(command_took, sys.executable, env=os.environ | bytecode)
         write_session(session)
         commands = {"--help": ["--help"]}
         commands |= {f"{verb} --help": [*verb.split(), "--help"] for verb in undulog.VERBS}
         commands["log info, a small session"] = ["log", "info", str(session)]
-        ours: dict[str, list[float]] = {name: [] for name in commands}
-        peer: dict[str, list[float]] = {name: [] for name in commands}
-        for turn in range(runs + 1):
-            for name, words in commands.items():
-                mine = processor_s(bytecode, "-m", "undulog", *words)
-                theirs = processor_s(bytecode, "-c", "import numpy")
-                if turn:
-                    ours[name].append(mine)
-                    peer[name].append(theirs)
+        starts = [
+            partial(start, *command)
+            for words in commands.values()
+            for command in (("-m", "undulog", *words), ("-c", "import numpy"))
+        ]
+        in_turn(1, *starts)  # fills the caches
+        took = in_turn(runs, *starts)
+    used = [[each.processor_s for each in turns] for turns in took]
+    peer = f"import of {versions('numpy')}"
     good = [
-        compared(
-            f"undulog {name}",
-            ours[name],
-            peer[name],
-            f"import of {versions('numpy')}",
-            bar=HELP if name.endswith("--help") else INFO,
-        )
-        for name in commands
+        compared(f"undulog {name}", mine, theirs, peer, bar=HELP if "--help" in name else INFO)
+        for name, mine, theirs in zip(commands, used[::2], used[1::2], strict=True)
     ]
     return int(not all(good))
 

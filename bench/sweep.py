@@ -69,9 +69,7 @@ def _rows(folder: Path, processes: int, cluster: str | None) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--runs", type=int, default=2000)
-    runs: int = parser.parse_args().runs
+    runs: int = arguments(__doc__, runs=2000).parse_args().runs
     few = max(20, runs // 10)
     with TemporaryDirectory() as name:
         folder = Path(name)

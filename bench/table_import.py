@@ -12,16 +12,15 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from measuring import arguments
-from numpy.typing import NDArray
+from measuring import Took, arguments, in_turn, took
 from pyarrow import parquet as arrow_parquet
 from records import compared, versions
 
@@ -62,31 +61,15 @@ def write_dataset(folder: Path, rows: int) -> Path:
     return data / "file-000.parquet"
 
 
-def turns(
-    ours: Callable[[], object], peer: Callable[[], object], out: Path, runs: int
-) -> NDArray[np.float64]:
-    """Return wall and processor times [s] of both, turn by turn, shape (2, 2, runs).
-
-    Args:
-        out: What ours writes; removed before each turn.
-    """
-    took = np.empty((2, 2, runs))
-    ours(), peer()  # what is imported late is imported now
-    for turn in range(runs):
-        for which, work in enumerate((ours, peer)):
-            out.unlink(missing_ok=True)
-            start = np.array([time.perf_counter(), time.process_time()])
-            work()
-            took[:, which, turn] = [time.perf_counter(), time.process_time()] - start
-    return took
+def anew(work: Callable[[], object], out: Path) -> Took:
+    """Return the cost of some work; the file that it writes is removed before."""
+    out.unlink(missing_ok=True)
+    return took(work)
 
 
 def main() -> int:
     """Write, import and read in turn, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--rows", type=int, default=60_000)
-    parser.add_argument("--runs", type=int, default=3)
-    options = parser.parse_args()
+    options = arguments(__doc__, rows=60_000, runs=3).parse_args()
     good = True
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
@@ -107,10 +90,14 @@ def main() -> int:
                 lambda: parquet.read_table(frames, columns=columns),
             ),
         ):
-            wall, processor = turns(ours, peer, out, options.runs).tolist()
+            works = partial(anew, ours, out), partial(anew, peer, out)
+            in_turn(1, *works)  # what is imported late is imported now
+            turns = in_turn(options.runs, *works)
+            processor = ([each.processor_s for each in side] for side in turns)
             good &= compared(what, *processor, name, bar=BAR)
+            wall = ([each.wall_s for each in side] for side in turns)
             compared(f"{what}, wall time", *wall, name)
-    return 0 if good else 1
+    return int(not good)
 
 
 if __name__ == "__main__":

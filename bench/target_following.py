@@ -158,9 +158,8 @@ def study(
 
 def main() -> None:
     """Run, print, keep."""
-    parser = arguments(__doc__)
+    parser = arguments(__doc__, jobs=2)
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
-    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--follow-limit", type=float, default=90.0, help="longest run [s]")
     parser.add_argument("--walk-limit", type=float, default=60.0, help="longest run [s]")
     parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)

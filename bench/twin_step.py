@@ -17,12 +17,13 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeVar
 
 import pybullet
-from measuring import arguments, chain
+from measuring import arguments, chain, in_turn, took
 from records import compared, versions
 
 from undulog.capture.robot.model import Plane, Robot
@@ -43,11 +44,8 @@ def step_twin(scenario: Scenario, kernels: Kernels) -> float:
     with Twin(scenario, kernels=kernels) as twin:
         samples = twin.samples()
         next(samples)  # the start: what is compiled is there from here on
-        start = time.process_time()
-        for _ in samples:
-            pass
-        used = time.process_time() - start
-    return used / (scenario.duration_s * scenario.physics_rate_hz)
+        used = took(lambda: deque(samples, maxlen=0))
+    return used.processor_s / (scenario.duration_s * scenario.physics_rate_hz)
 
 
 def step_builtin(scenario: Scenario) -> float:
@@ -122,31 +120,26 @@ def built_in_body(robot: Robot, client: int) -> int:
     return body
 
 
-def turns(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, list[float]]:
+def turns(ways: Mapping[_Way, Callable[[], float]], runs: int) -> dict[_Way, list[float]]:
     """Return microseconds a step of each way, turn by turn."""
-    found: dict[_Way, list[float]] = {name: [] for name in ways}
-    for _ in range(runs):
-        for name, step in ways.items():
-            found[name].append(1e6 * step())
-    return found
+    found = in_turn(runs, *ways.values())
+    return {name: [1e6 * s for s in each] for name, each in zip(ways, found, strict=True)}
 
 
-def least(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, float]:
-    """Return microseconds a step of each way, the least of some runs in turn."""
-    return {name: min(each) for name, each in turns(ways, runs).items()}
+def without_sensors(scenario: Scenario) -> Scenario:
+    """Return a scenario whose sensors are off."""
+    sensing = dataclasses.replace(scenario.sensing, enabled=False)
+    return dataclasses.replace(scenario, sensing=sensing)
 
 
 def main() -> None:
     """Step all in turn, print."""
-    parser = arguments(__doc__)
-    parser.add_argument("--seconds", type=float, default=1.0)
-    parser.add_argument("--runs", type=int, default=5)
-    options = parser.parse_args()
+    options = arguments(__doc__, seconds=1.0, runs=5).parse_args()
     whole = load_scenario("flat").changed(duration_s=options.seconds)
-    flat = dataclasses.replace(whole, sensing=dataclasses.replace(whole.sensing, enabled=False))
+    flat = without_sensors(whole)
     mujoco = dataclasses.replace(flat, engine=EngineKind.MUJOCO)
     step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
-    took = turns(
+    found = turns(
         {
             f"{name}{more}": partial(step_twin, scenario, kernels)
             for more, scenario in (("", flat), (", MuJoCo", mujoco), (", all sensors", whole))
@@ -155,12 +148,12 @@ def main() -> None:
         | {BUILT_IN: partial(step_builtin, flat)},
         options.runs,
     )
-    each = {name: min(costs) for name, costs in took.items()}
+    each = {name: min(costs) for name, costs in found.items()}
     theirs = each[BUILT_IN]
     peer = f"{versions('pybullet')}, its contacts and motors"
     for name in (NUMPY, NUMBA):
         what = f"step of 25 joints, {name}"
-        compared(what, took[name], took[BUILT_IN], peer, unit="us")
+        compared(what, found[name], found[BUILT_IN], peer, unit="us")
     print(
         f"25 joints at 1 kHz: {1e3 / each[NUMPY]:.1f} x real time with NumPy and "
         f"{1e3 / each[NUMBA]:.1f} x with numba; a step {theirs / each[NUMPY]:.1f} and "
@@ -179,8 +172,8 @@ def main() -> None:
             NUMBA: partial(step_twin, scenario, Kernels.NUMBA),
             BUILT_IN: partial(step_builtin, scenario),
         }
-        for name, step_us in least(ways, options.runs).items():
-            rows[name].append(step_us)
+        for name, costs in turns(ways, options.runs).items():
+            rows[name].append(min(costs))
     for name, costs in rows.items():
         print(f"{name:<27}" + "".join(f"{cost:9.0f}" for cost in costs))
     print(f"\nload average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")

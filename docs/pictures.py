@@ -2,8 +2,9 @@
 
 ``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
 screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the view of a recording that
-runs, the body's motion, and the report's first figure as a picture of its own that follows the
-reader's light or dark scheme. With ``--quick`` one tab and a small clip, only to see that it runs.
+runs, a session of the twin beside its commands run again on ground with less sideways grip, the
+body's motion, and the report's first figure as a picture of its own that follows the reader's light
+or dark scheme. With ``--quick`` one tab, a small clip, sessions of 3 s, to see that it runs.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from undulog.replay.viewer import HeadlessViewer
 
 SECONDS = 12.3
 SCENARIO = "weak-servo-pi3"
+QUICK_S = 3.0
 LIVE_S = 13.0
 DEGREES = 90
 TITLE_BAR = 36
@@ -94,6 +96,22 @@ def live_picture(target: Path) -> None:
     picture.crop((0, TITLE_BAR, *picture.size)).save(target, optimize=True)
 
 
+def side_by_side_picture(target: Path, *, quick: bool) -> None:
+    """Draw the viewer with a session of the twin that plays the robot, and its repetition."""
+    short = ["--duration", f"{QUICK_S:g}"] if quick else []
+    with tempfile.TemporaryDirectory() as folder:
+        robot, twin, both = (f"{folder}/{name}" for name in ("robot.mcap", "twin.mcap", "both.rrd"))
+        change = "world.ground.mu_normal=0.35"
+        for words in (
+            ["sim", "run", SCENARIO, *short, "-o", robot],
+            ["replay", robot, "--on", "twin", "--set", change, "-o", twin],
+            ["view", robot, twin, "--save", both],
+        ):
+            if code := undulog.run(words):
+                sys.exit(code)
+        window_picture(Path(both), target, QUICK_S / 2 if quick else SECONDS)
+
+
 def clip(demo: Path, target: Path, *size: str) -> None:
     """Write the body's motion over one period."""
     words = [demo / "session.mcap", "--clip", target, *CLIP, *size, "--force"]
@@ -125,7 +143,7 @@ def main() -> None:
     )
     parser.add_argument("demo", type=Path, help="what `make demo` left")
     parser.add_argument("images", type=Path, help="the folder to write to")
-    parser.add_argument("--quick", action="store_true", help="one tab and a small clip")
+    parser.add_argument("--quick", action="store_true", help="one tab, a small clip, 3 s")
     options = parser.parse_args()
     images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
@@ -133,6 +151,7 @@ def main() -> None:
         replay_picture(options.demo, images, tab)
     if not options.quick:
         live_picture(images / "live.png")
+    side_by_side_picture(images / "side-by-side.png", quick=options.quick)
     clip(options.demo, images / "clip.gif", *(QUICK if options.quick else SMALL))
     response_picture(options.demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):

@@ -12,14 +12,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import av
 import numpy as np
 import rerun.blueprint as rrb
 from av.error import FFmpegError
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
-from av.video.stream import VideoStream
 from PIL import Image, ImageDraw, ImageFont
 
 from undulog.capture.common.arrays import FloatArray
@@ -91,12 +90,18 @@ def check_film(kind: str, size: tuple[int, int], fps: int) -> None:
 class Film:
     """A file that takes frames: one stream of a container."""
 
+    codec: ClassVar[str]
+    pixels: ClassVar[str]
     options: ClassVar[dict[str, str]] = {}
 
-    def __init__(self, container: Any, stream: VideoStream, fps: int) -> None:
-        """Take a stream of the container that has no frames yet."""
+    def __init__(
+        self, container: Any, size: tuple[int, int], fps: int, _samples: Sequence[Image.Image]
+    ) -> None:
+        """Add a stream to the container."""
         self._container = container
-        self._stream: Any = stream  # the stub's packets are of unknown kind
+        self._stream = container.add_stream(self.codec, rate=fps)
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = self.pixels
         self._step, self._count = Fraction(1, fps), 0
 
     def add(self, frame: Image.Image) -> None:
@@ -120,10 +125,12 @@ class Film:
 class _Gif(Film):
     """One palette for all frames and no dither: what doesn't move doesn't flicker, and is small."""
 
+    codec, pixels = "gif", "pal8"
+
     def __init__(
         self, container: Any, size: tuple[int, int], fps: int, samples: Sequence[Image.Image]
     ) -> None:
-        super().__init__(container, _stream(container, "gif", size, fps, "pal8"), fps)
+        super().__init__(container, size, fps, samples)
         sheet = Image.new("RGB", (size[0], size[1] * len(samples)))
         for row, sample in enumerate(samples):
             sheet.paste(sample, (0, row * size[1]))
@@ -146,17 +153,17 @@ class _Gif(Film):
 class _Mp4(Film):
     """H.264 that every browser plays, its colours named, its index in front."""
 
+    codec, pixels = "libx264", "yuv420p"
     options: ClassVar[dict[str, str]] = {"movflags": "+faststart"}
 
     def __init__(
-        self, container: Any, size: tuple[int, int], fps: int, _samples: Sequence[Image.Image]
+        self, container: Any, size: tuple[int, int], fps: int, samples: Sequence[Image.Image]
     ) -> None:
-        stream = _stream(container, "libx264", size, fps, "yuv420p")
-        coder = stream.codec_context
+        super().__init__(container, size, fps, samples)
+        coder = self._stream.codec_context
         coder.options = {"crf": "18", "preset": "medium"}
         coder.colorspace, coder.color_range = Colorspace.ITU709, ColorRange.MPEG
         coder.color_primaries, coder.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
-        super().__init__(container, stream, fps)
 
     def add(self, frame: Image.Image) -> None:
         """Append a frame."""
@@ -169,15 +176,6 @@ class _Mp4(Film):
                 dst_color_trc=ColorTrc.IEC61966_2_1,
             )
         )
-
-
-def _stream(
-    container: Any, codec: Literal["gif", "libx264"], size: tuple[int, int], fps: int, pixels: str
-) -> VideoStream:
-    stream: VideoStream = container.add_stream(codec, rate=fps)
-    stream.width, stream.height = size
-    stream.pix_fmt = pixels
-    return stream
 
 
 SIDES = (160, 2160)

@@ -17,16 +17,13 @@ from typing import Any
 
 from undulog.analysis.compare.compare import compare_sessions
 from undulog.analysis.results.comparison import Comparison
-from undulog.capture import Session, SessionView, load_robot
-from undulog.capture.common.console import echo, emit_json
-from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
+from undulog.capture import Session, SessionView
+from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edited_log import RawLog
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
-from undulog.sim.commands.drive import drive_armed, dry_run_on_bus, early_end
 from undulog.sim.drive.in_process import drive_twin
 from undulog.sim.drive.motion import MotionSource, find_motion
-from undulog.sim.drive.over_bus import bus_address
 from undulog.sim.scenario.scenario import Scenario
 from undulog.sim.scenario.scenario_file import load_scenario
 from undulog.sim.twin.recording import Recording
@@ -224,66 +221,3 @@ def what_next(original: Path, again: Path, *, comparable: bool) -> list[str]:
     verbs = ("view", "compare") if comparable else ("view",)
     leads = ("Next: ", "      ")
     return [f"{lead}undulog {verb} {both}" for lead, verb in zip(leads, verbs, strict=False)]
-
-
-def replay_on_bus(
-    file: Path,
-    on: str,
-    show: Callable[[Comparison], None],
-    *,
-    arm: bool = False,
-    robot: str | None = None,
-    duration_s: float | None = None,
-    output: Path | None = None,
-    recorder: Path | None = None,
-    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
-    force: bool = False,
-    as_json: bool = False,
-) -> int:
-    """Send a session's commands on a bus, and report the outcome and the differences.
-
-    Args:
-        arm: Whether commands are sent; a dry run in the twin if not.
-        robot: The robot on the bus, a name or a file; the session's own if None.
-        duration_s: How long [s]; as long as there are commands if None.
-        output: The session to write; a dry run needs none.
-        recorder: Control socket of a recorder that receives the gait; the only one that runs if
-            None.
-        topics: Of commands and responses of the session.
-        as_json: Report as one JSON object.
-
-    Returns:
-        The exit code: 0 if it ran to its end, 1 if not.
-
-    Raises:
-        UsageError: If something of it can't be, e.g. the session is of another joint set.
-        SourceError: If nobody is there, or the robot is no robot to start with.
-        LogError: If the session can't be read, or has no commands.
-    """
-    bus_address(on)
-    described = load_robot(robot) if robot is not None else None
-    driven = find_motion(str(file), robot=described, command_topic=topics[0])
-    if driven.kind != "commands":
-        raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
-    given: dict[str, Any] = {"robot": described, "duration_s": duration_s, "output": output}
-    given |= {"recorder": recorder, "force": force}
-    if not arm:
-        return dry_run_on_bus(driven, on, as_json=as_json, **given)
-    report = drive_armed(driven, on, **given)
-    comparison, why = None, "it did not run to its end"
-    if report.complete:
-        with Session.open(file) as first, Session.open(report.plan.output) as second:
-            comparison, why = compared(first.with_joints(*topics), second)
-    if as_json:
-        facts = None if comparison is None else comparison.to_dict()
-        emit_json(
-            {"original": str(file), **report.facts(), "comparison": facts, "not_compared": why}
-        )
-    else:
-        echo(*report.lines())
-        if comparison is not None:
-            show(comparison)
-        elif report.complete:
-            echo(f"Not compared: {why}")
-        echo(*what_next(file, report.plan.output, comparable=comparison is not None))
-    return early_end(report)

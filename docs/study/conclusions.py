@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.special import stdtrit
@@ -25,14 +27,12 @@ class Conclusion:
         sentence: What it says; ``{value}`` stands for value and interval.
         bound: What the interval has to lie above or below.
         above: Whether above.
-        of: Value and both ends of the 95 % interval, of the results.
     """
 
     name: str
     sentence: str
     bound: float
     above: bool
-    of: Callable[[Results], Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Verdict:
         return f"{end:.3g} {sign} {self.conclusion.bound:g}"
 
 
-def _exponent(outcome: str, factor: str) -> Callable[[Results], Sequence[float]]:
-    return lambda results: results.exponents[outcome].loc[factor].tolist()
+def _exponent(factor: str) -> Callable[[Results], Sequence[float]]:
+    return lambda results: results.exponents["lag_sd"].loc[factor].tolist()
 
 
 def _boundary_identical(results: Results) -> Sequence[float]:
@@ -132,10 +132,6 @@ def _rough_across(results: Results) -> Sequence[float]:
     return (float(distance[-1] / distance[0]) if len(distance) > 1 else np.nan,) * 3
 
 
-def _load_group(results: Results) -> Sequence[float]:
-    return foretold(results.points).tolist()
-
-
 def _alone(results: Results) -> Sequence[float]:
     """Largest share of starts from which the body alone synchronises a chain."""
     table = results.chains
@@ -143,147 +139,31 @@ def _alone(results: Results) -> Sequence[float]:
     return float(share), float(share), float(share)
 
 
-CONCLUSIONS = (
-    Conclusion(
-        "weak-servos",
-        "Weak servos make joints unequal: the spread of lag goes as stall torque to the {value}.",
-        0.0,
-        above=False,
-        of=_exponent("lag_sd", "stall_torque"),
-    ),
-    Conclusion(
-        "friction",
-        "Friction across the body makes joints unequal: the spread of lag goes as mu_n to the "
-        "{value}.",
-        0.0,
-        above=True,
-        of=_exponent("lag_sd", "mu_normal"),
-    ),
-    Conclusion(
-        "short-waves",
-        "Long waves make joints unequal: the spread of lag goes as the lag between joints to "
-        "the {value}.",
-        0.0,
-        above=False,
-        of=_exponent("lag_sd", "lag"),
-    ),
-    Conclusion(
-        "long-chains",
-        "From 9 joints on longer chains are less unequal, since the ends keep their size: the "
-        "spread "
-        "of lag goes as n to the {value}.",
-        0.0,
-        above=False,
-        of=_beyond_a_wave,
-    ),
-    Conclusion(
-        "load",
-        "Shape, and friction and inertia together over the servo's stiffness, foretell {value} of "
-        "the variance of ln spread of points that were run later.",
-        0.3,
-        above=True,
-        of=_load_group,
-    ),
-    Conclusion(
-        "rough-across",
-        "It is friction across that moves the robot: it goes {value} times as far with the "
-        "roughest floor "
-        "across as with friction alike both ways.",
-        5.0,
-        above=True,
-        of=_rough_across,
-    ),
-    Conclusion(
-        "contact",
-        "Up to 9 joints it is contact that makes them unequal: with it the spread of lag is "
-        "{value} times as large.",
-        2.0,
-        above=True,
-        of=lambda results: short_ratio(results.contact).tolist(),
-    ),
-    Conclusion(
-        "boundary",
-        "Of identical modules reversal gives the boundary all of the spread: a share of {value}.",
-        0.99,
-        above=True,
-        of=_boundary_identical,
-    ),
-    Conclusion(
-        "module",
-        "The pair of a weak module has the largest contrast in a share of {value} of the points.",
-        0.5,
-        above=True,
-        of=_named,
-    ),
-    Conclusion(
-        "non-normal",
-        "P is not normal: an error of P can move the rates at least {value} times as far.",
-        2.0,
-        above=True,
-        of=_worst("condition", min),
-    ),
-    Conclusion(
-        "not-neighbours",
-        "From 9 joints on next neighbours hold at most {value} of the off-diagonal energy of P.",
-        0.7,
-        above=False,
-        of=_worst("band1", max, least=9),
-    ),
-    Conclusion(
-        "neutral",
-        "The body alone leaves a pattern to itself or drives it: the slowest rate is at most "
-        "{value} eps.",
-        0.02,
-        above=False,
-        of=_worst("gap", max),
-    ),
-    Conclusion(
-        "never-alone",
-        "The body alone synchronises no chain: from a share of {value} of the starts.",
-        0.5,
-        above=False,
-        of=_alone,
-    ),
-    Conclusion(
-        "linear",
-        "P predicts random patterns of 0.1 rad: its error is at most {value} of that of "
-        "joints that "
-        "keep their response.",
-        0.5,
-        above=False,
-        of=_worst("held_out", max),
-    ),
-    Conclusion(
-        "helps",
-        "With weak servos the body spares explicit coupling: the longest chain needs {value} "
-        "of what "
-        "it needs without a body.",
-        1.0,
-        above=False,
-        of=_explicit,
-    ),
-    Conclusion(
-        "path",
-        "A path of next neighbours takes a time to synchronise that grows as n to the {value}.",
-        1.3,
-        above=True,
-        of=_time_exponent("path"),
-    ),
-    Conclusion(
-        "body-and-path",
-        "With weak servos the identified body beside the path changes that exponent by {value}.",
-        0.0,
-        above=False,
-        of=_time_exponent("path + identified", "against_"),
-    ),
-    Conclusion(
-        "heterogeneity",
-        "The longest chain of weak servos takes {value} times as long with the body as it is as "
-        "with a homogeneous one of the same strength.",
-        1.0,
-        above=True,
-        of=_heterogeneity,
-    ),
+OF: dict[str, Callable[[Results], Sequence[float]]] = {
+    "weak-servos": _exponent("stall_torque"),
+    "friction": _exponent("mu_normal"),
+    "short-waves": _exponent("lag"),
+    "long-chains": _beyond_a_wave,
+    "load": lambda results: foretold(results.points).tolist(),
+    "rough-across": _rough_across,
+    "contact": lambda results: short_ratio(results.contact).tolist(),
+    "boundary": _boundary_identical,
+    "module": _named,
+    "non-normal": _worst("condition", min),
+    "not-neighbours": _worst("band1", max, least=9),
+    "neutral": _worst("gap", max),
+    "never-alone": _alone,
+    "linear": _worst("held_out", max),
+    "helps": _explicit,
+    "path": _time_exponent("path"),
+    "body-and-path": _time_exponent("path + identified", "against_"),
+    "heterogeneity": _heterogeneity,
+}
+"""Value and both ends of the 95 % interval of each conclusion."""
+
+CONCLUSIONS = tuple(
+    Conclusion(name, **table)
+    for name, table in tomllib.loads(Path(__file__).with_suffix(".toml").read_text()).items()
 )
 
 
@@ -293,7 +173,7 @@ def evaluate(results: Results) -> list[Verdict]:
 
 
 def _verdict(one: Conclusion, results: Results) -> Verdict:
-    value, low, high = (float(x) for x in one.of(results))
+    value, low, high = (float(x) for x in OF[one.name](results))
     holds = low > one.bound if one.above else high < one.bound
     too_few = not np.isfinite([low, high]).all()
     return Verdict(one, value, low, high, None if too_few else bool(holds))

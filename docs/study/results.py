@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-
-from undulog.capture.common.arrays import FloatArray
 
 from . import chains, coupling, heterogeneity
 from .rows import digest, read_rows
@@ -48,13 +45,6 @@ class Results:
         if column not in found:  # not run yet
             return found.assign(**{column: None})
         return found.sort_values(column, ignore_index=True)
-
-    def chain(self, n: int, stall: float, column: str) -> FloatArray:
-        """Return a measure of a chain with the ends of its interval, shape (3,)."""
-        table = self.measures
-        one = table[(table["n"] == n) & (table["stall"] == stall)].iloc[0]
-        ends = [one.get(f"{column}_{end}", one[column]) for end in ("low", "high")]
-        return np.array([one[column], *ends], dtype=float)
 
 
 SLICES = {

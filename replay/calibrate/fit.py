@@ -55,7 +55,7 @@ from .parameters import (
     unknowns,
     with_values,
 )
-from .solve import Solution, derivatives, normal_of, slope_of, solve
+from .solve import LeastSquares, Solution, derivatives, solve
 
 SIGNIFICANT = 0.05
 
@@ -102,9 +102,11 @@ def find_weak_module(
         wanted = (*shared.unknowns, module_unknown(answers.scenario, joint, spread))
         own = derivatives(answers, wanted, np.append(shared.x, 0.0), [len(shared.x)])
         columns = [np.hstack(pair) for pair in zip(shared.columns, own, strict=True)]
-        normal = normal_of(columns, shared.sigma, np.append(shared.precision, spread**-2))
-        slope = float(slope_of(own, shared.after, shared.sigma)[0])
-        gains.append(slope**2 * float(np.linalg.inv(normal)[-1, -1]))
+        whole, alone = (
+            LeastSquares(of, shared.after, shared.sigma, np.append(shared.precision, spread**-2))
+            for of in (columns, own)
+        )
+        gains.append(float(alone.slope[0]) ** 2 * float(np.linalg.inv(whole.normal)[-1, -1]))
     best = joints[int(np.argmax(gains))]
     wanted = (*shared.unknowns, module_unknown(answers.scenario, best, spread))
     fitted = solve(answers, wanted, start=np.append(shared.x, 0.0), on_iteration=on_iteration)

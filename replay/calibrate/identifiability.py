@@ -36,7 +36,7 @@ from undulog.sim.scenario.scenario import Scenario
 from undulog.sim.scenario.world import FrictionLaw
 
 from .parameters import DELAY, Answers, Unknown, with_values
-from .solve import Solution, covariance_with, solve
+from .solve import LeastSquares, Solution, solve
 
 Z95 = 1.959963984540054
 
@@ -248,7 +248,8 @@ def _tried(
     columns = [np.column_stack([J, own]) for J, own in zip(solution.columns, column, strict=True)]
     precision = np.append(solution.precision, spread**-2)
     prior = precision * np.append(solution.x, 0.0)
-    step, covariance = covariance_with(columns, solution.after, solution.sigma, precision, prior)
+    problem = LeastSquares(columns, solution.after, solution.sigma, precision)
+    step, covariance = problem.step(prior)
     size, error = float(step[-1]), math.sqrt(float(covariance[-1, -1]))
     p = math.erfc(abs(size) / error / math.sqrt(2.0))
     return Alternative(label, size, error, p, step[:-1], covariance[:-1, :-1], widens)

@@ -38,7 +38,7 @@ from undulog.capture.common.arrays import FloatArray
 
 from .identifiability import Alternative
 from .parameters import Measured
-from .solve import deviations, normal_of, score_covariance, slope_of
+from .solve import LeastSquares, deviations
 
 _STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
@@ -285,12 +285,12 @@ def halves(
         # Where an encoder has its zero is a half's own affair, too.
         J = [column[part] - column[part].mean(axis=0) for column in columns]
         rest = [r[part] - r[part].mean() for r in residuals]
-        normal = normal_of(J, sigma, precision)
+        half = LeastSquares(J, rest, sigma, precision)
+        normal = half.normal
         inverse: FloatArray = np.linalg.inv(normal).astype(np.float64)
-        scores = score_covariance(J, rest, sigma, precision)
         # Never less than white noise has it, as in the fit itself.
-        covariance += inverse @ _larger(scores, normal - prior) @ inverse
-        steps.append(inverse @ (slope_of(J, rest, sigma) - precision * x))
+        covariance += inverse @ _larger(half.scores(), normal - prior) @ inverse
+        steps.append(inverse @ (half.slope - precision * x))
         inverses.append(inverse)
     apart = inverses[0] - inverses[1]
     covariance += apart @ prior @ apart

@@ -37,7 +37,7 @@ is too small. Hence g in two steps (prewhitening: Andrews & Monahan, *Econometri
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -88,57 +88,85 @@ def memory(residuals: Sequence[FloatArray]) -> float:
     return max(float(tau[ended[0] if ended.size else -1]), 1.0)
 
 
-def score_covariance(
-    columns: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    sigma: FloatArray,
-    precision: FloatArray,
-) -> FloatArray:
-    """B.
+@dataclass(frozen=True)
+class LeastSquares:
+    """The weighted problem to first order around x.
 
-    Args:
+    Attributes:
         columns: J_j, shapes (n_j, K).
-        residuals: [rad], shapes (n_j,).
-        sigma: Shape (r,).
+        residuals: r_j [rad], shapes (n_j,).
+        sigma: Standard deviation of each joint's residual [rad], shape (r,).
         precision: Diagonal of P^-1, shape (K,).
-
-    Returns:
-        Shape (K, K).
     """
-    weighted = _Weighted(columns, residuals, sigma, precision)
-    phi = float(minimize_scalar(weighted.criterion, bounds=(0.0, _MOST), method="bounded").x)
-    innovations = weighted.innovations(phi)
-    reach = int(np.ceil(_WINDOW * memory(innovations)))
-    total = np.zeros((precision.size, precision.size))
-    for column, left, s in zip(columns, innovations, sigma.tolist(), strict=True):
-        n = len(left)
-        lags = np.arange(min(reach, n - 1) + 1)
-        covariance = np.fft.irfft(np.abs(np.fft.rfft(left, 2 * n)) ** 2)[: lags.size] / n
-        half = covariance * np.clip(2.0 - 2.0 * lags / reach, 0.0, 1.0)
-        color = phi ** np.abs(np.arange(1 - n, n)) / (1.0 - phi**2)
-        kernel = fftconvolve(np.concatenate([half[:0:-1], half]), color)[:, None]
-        middle = len(kernel) // 2
-        total += column.T @ fftconvolve(column, kernel, axes=0)[middle : middle + n] / s**2
-    return (total + total.T) / 2
+
+    columns: Sequence[FloatArray]
+    residuals: Sequence[FloatArray]
+    sigma: FloatArray
+    precision: FloatArray
+
+    @property
+    def normal(self) -> FloatArray:
+        """A, shape (K, K)."""
+        return np.diag(self.precision) + sum(
+            (c.T @ c / s**2 for c, s in zip(self.columns, self.sigma.tolist(), strict=True)),
+            start=np.zeros((self.precision.size, self.precision.size)),
+        )
+
+    @property
+    def slope(self) -> FloatArray:
+        """J' W r, shape (K,)."""
+        parts = zip(self.columns, self.residuals, self.sigma.tolist(), strict=True)
+        return np.sum([c.T @ r / s**2 for c, r, s in parts], axis=0)
+
+    def scores(self) -> FloatArray:
+        """B, shape (K, K)."""
+        weighted = _Weighted(self)
+        phi = float(minimize_scalar(weighted.criterion, bounds=(0.0, _MOST), method="bounded").x)
+        innovations = weighted.innovations(phi)
+        reach = int(np.ceil(_WINDOW * memory(innovations)))
+        total = np.zeros((self.precision.size, self.precision.size))
+        for column, left, s in zip(self.columns, innovations, self.sigma.tolist(), strict=True):
+            n = len(left)
+            lags = np.arange(min(reach, n - 1) + 1)
+            covariance = np.fft.irfft(np.abs(np.fft.rfft(left, 2 * n)) ** 2)[: lags.size] / n
+            half = covariance * np.clip(2.0 - 2.0 * lags / reach, 0.0, 1.0)
+            color = phi ** np.abs(np.arange(1 - n, n)) / (1.0 - phi**2)
+            kernel = fftconvolve(np.concatenate([half[:0:-1], half]), color)[:, None]
+            middle = len(kernel) // 2
+            total += column.T @ fftconvolve(column, kernel, axes=0)[middle : middle + n] / s**2
+        return (total + total.T) / 2
+
+    def covariance(self) -> FloatArray:
+        """A^-1 (B + P^-1) A^-1, no direction narrower than A^-1 has it."""
+        scores = self.scores()
+        values, vectors = np.linalg.eigh(self.normal)
+        root = vectors / np.sqrt(values)  # columns: root' A root = 1
+        share, turn = np.linalg.eigh(root.T @ (scores + np.diag(self.precision)) @ root)
+        spread = root @ turn
+        return (spread * np.maximum(share, 1.0)) @ spread.T
+
+    def step(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """One step of a fit, shape (K,), and the covariance there, shape (K, K).
+
+        Args:
+            prior: P^-1 x where the residuals were taken, shape (K,).
+        """
+        step = np.linalg.solve(self.normal, self.slope - prior)
+        left = [r - c @ step for c, r in zip(self.columns, self.residuals, strict=True)]
+        return np.asarray(step, dtype=np.float64), replace(self, residuals=left).covariance()
 
 
 class _Weighted:
     """Columns and residuals in units of each joint's deviation, with a mean for each joint."""
 
-    def __init__(
-        self,
-        columns: Sequence[FloatArray],
-        residuals: Sequence[FloatArray],
-        sigma: FloatArray,
-        precision: FloatArray,
-    ) -> None:
-        means = np.eye(len(residuals))
+    def __init__(self, problem: LeastSquares) -> None:
+        sigma, means = problem.sigma.tolist(), np.eye(len(problem.residuals))
         self._columns = [
             np.hstack([column / s, np.tile(mean, (len(column), 1))])
-            for column, s, mean in zip(columns, sigma.tolist(), means, strict=True)
+            for column, s, mean in zip(problem.columns, sigma, means, strict=True)
         ]
-        self._residuals = [r / s for r, s in zip(residuals, sigma.tolist(), strict=True)]
-        self._precision = np.concatenate([precision, np.zeros(len(residuals))])
+        self._residuals = [r / s for r, s in zip(problem.residuals, sigma, strict=True)]
+        self._precision = np.concatenate([problem.precision, np.zeros(len(means))])
 
     def criterion(self, phi: float) -> float:
         """-2 ln of the restricted likelihood, less a constant."""
@@ -252,12 +280,12 @@ def solve(
         sigma = deviations(residuals)
         if not converged:  # the last step is too small to change them
             columns = derivatives(answers, wanted, x)
-        normal = normal_of(columns, sigma, precision)
+        problem = LeastSquares(columns, residuals, sigma, precision)
         if converged or iterations >= most:
             break
         iterations += 1
         on_iteration(iterations, float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))))
-        slope = slope_of(columns, residuals, sigma) - precision * x
+        normal, slope = problem.normal, problem.slope - precision * x
         errors = np.sqrt(np.diag(np.linalg.inv(normal)))
         cost = _cost(residuals, sigma, precision, x)
         for _ in range(_TRIES):
@@ -282,7 +310,7 @@ def solve(
     return Solution(
         unknowns=wanted,
         x=x,
-        covariance=_covariance(columns, residuals, sigma, precision),
+        covariance=problem.covariance(),
         before=before,
         after=residuals,
         columns=columns,
@@ -317,31 +345,6 @@ def derivatives(
     return tuple(np.stack(parts, axis=1) for parts in zip(*found, strict=True))
 
 
-def covariance_with(
-    columns: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    sigma: FloatArray,
-    precision: FloatArray,
-    prior: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """One step of a fit with other columns, and the covariance there.
-
-    Args:
-        columns: Derivatives, shapes (n_j, K).
-        residuals: [rad], shapes (n_j,).
-        sigma: Deviation of each joint's residual [rad], shape (r,).
-        precision: Diagonal of P^-1, shape (K,).
-        prior: P^-1 x where the residuals were taken, shape (K,).
-
-    Returns:
-        The step, shape (K,), and the covariance, shape (K, K).
-    """
-    normal = normal_of(columns, sigma, precision)
-    step = np.linalg.solve(normal, slope_of(columns, residuals, sigma) - prior)
-    left = [r - c @ step for c, r in zip(columns, residuals, strict=True)]
-    return np.asarray(step, dtype=np.float64), _covariance(columns, left, sigma, precision)
-
-
 def _residuals(
     answers: Answers, wanted: Sequence[Unknown], x: FloatArray
 ) -> tuple[FloatArray, ...]:
@@ -354,41 +357,8 @@ def _precision(wanted: Sequence[Unknown]) -> FloatArray:
     return np.array([one.spread**-2 for one in wanted])
 
 
-def normal_of(
-    columns: Sequence[FloatArray], sigma: FloatArray, precision: FloatArray
-) -> FloatArray:
-    """A of J = ``columns``, shape (K, K)."""
-    return np.diag(precision) + sum(
-        (c.T @ c / s**2 for c, s in zip(columns, sigma.tolist(), strict=True)),
-        start=np.zeros((precision.size, precision.size)),
-    )
-
-
-def slope_of(
-    columns: Sequence[FloatArray], residuals: Sequence[FloatArray], sigma: FloatArray
-) -> FloatArray:
-    """J' W r, shape (K,)."""
-    parts = zip(columns, residuals, sigma.tolist(), strict=True)
-    return np.sum([c.T @ r / s**2 for c, r, s in parts], axis=0)
-
-
 def _cost(
     residuals: Sequence[FloatArray], sigma: FloatArray, precision: FloatArray, x: FloatArray
 ) -> float:
     misfit = sum(float(r @ r) / s**2 for r, s in zip(residuals, sigma.tolist(), strict=True))
     return misfit + float(precision @ x**2)
-
-
-def _covariance(
-    columns: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    sigma: FloatArray,
-    precision: FloatArray,
-) -> FloatArray:
-    """A^-1 (B + P^-1) A^-1, no direction narrower than A^-1 has it."""
-    scores = score_covariance(columns, residuals, sigma, precision)
-    values, vectors = np.linalg.eigh(normal_of(columns, sigma, precision))
-    root = vectors / np.sqrt(values)  # columns: root' A root = 1
-    share, turn = np.linalg.eigh(root.T @ (scores + np.diag(precision)) @ root)
-    spread = root @ turn
-    return (spread * np.maximum(share, 1.0)) @ spread.T

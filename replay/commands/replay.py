@@ -67,31 +67,17 @@ def replay(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
+    from undulog.sim.commands.run import check_session_name, speed_text
+
     if output is not None:
-        if output.suffix != ".mcap":
-            raise UsageError(
-                f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
-            )
+        check_session_name(output)
         refuse_existing(output, force=force)
     scheme, colon, world = on.partition(":")
     if scheme != _TWIN:
-        from ..reproduce import replay_on_bus
-
         if change:
             raise UsageError("--set changes the twin's world: on a bus the world is as it is")
-        return replay_on_bus(
-            file,
-            on,
-            _show,
-            arm=arm,
-            robot=robot,
-            topics=topics.names,
-            duration_s=duration,
-            output=output,
-            recorder=recorder,
-            force=force,
-            as_json=json,
-        )
+        given = {"duration_s": duration, "output": output, "recorder": recorder, "force": force}
+        return _on_bus(file, on, robot, topics.names, arm=arm, as_json=json, **given)
     if colon and not world:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
     if arm or robot is not None or recorder is not None:
@@ -111,9 +97,7 @@ def replay(
             output,
             force=force,
             stop=stop,
-            on_sample=lambda sample: bar.update(
-                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
-            ),
+            on_sample=lambda sample: bar.update(sample.time_s, speed_text(sample.time_s, start)),
         )
     if json:
         emit_json(_reported(again, changes))
@@ -123,6 +107,60 @@ def replay(
             _show(again.comparison)
         echo(*what_next(file, again.recording.path, comparable=again.comparison is not None))
     return 0
+
+
+def _on_bus(
+    file: Path,
+    on: str,
+    robot: str | None,
+    topics: tuple[str, str],
+    *,
+    arm: bool,
+    as_json: bool,
+    **given: Any,
+) -> int:
+    """Send a session's commands on a bus, and report the outcome and the differences.
+
+    Args:
+        topics: Of commands and responses of the session.
+        given: The rest of a :class:`~undulog.sim.commands.drive.BusDrive`.
+
+    Returns:
+        The exit code: 0 if it ran to its end, 1 if not.
+    """
+    from undulog.capture import Session, load_robot
+    from undulog.sim.commands.drive import BusDrive, early_end
+    from undulog.sim.drive.motion import find_motion
+    from undulog.sim.drive.over_bus import bus_address
+
+    from ..reproduce import compared, what_next
+
+    bus_address(on)
+    described = load_robot(robot) if robot is not None else None
+    driven = find_motion(str(file), robot=described, command_topic=topics[0])
+    if driven.kind != "commands":
+        raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
+    bus = BusDrive(driven, on, described, **given)
+    if not arm:
+        return bus.dry_run(as_json=as_json)
+    report = bus.drive()
+    comparison, why = None, "it did not run to its end"
+    if report.complete:
+        with Session.open(file) as first, Session.open(report.plan.output) as second:
+            comparison, why = compared(first.with_joints(*topics), second)
+    if as_json:
+        facts = None if comparison is None else comparison.to_dict()
+        emit_json(
+            {"original": str(file), **report.facts(), "comparison": facts, "not_compared": why}
+        )
+    else:
+        echo(*report.lines())
+        if comparison is not None:
+            _show(comparison)
+        elif report.complete:
+            echo(f"Not compared: {why}")
+        echo(*what_next(file, report.plan.output, comparable=comparison is not None))
+    return early_end(report)
 
 
 def _show(comparison: Comparison) -> None:

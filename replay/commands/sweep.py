@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress
+from undulog.capture.common.console import emit, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -62,10 +62,8 @@ def sweep(
     if dry_run:
         at_a_time = workers_of(cluster) if cluster is not None else workers or processors()
         cost = cost_of(prepared, RowStore(output), at_a_time)
-        if json:
-            emit_json({**asdict(cost), "points": prepared.points, "to_run": cost.to_run})
-        else:
-            echo(*_cost_lines(plan, prepared, cost))
+        facts = {**asdict(cost), "points": prepared.points, "to_run": cost.to_run}
+        emit(facts, _cost_lines(plan, prepared, cost), as_json=json)
         return 0
     start = time.monotonic()
     with interruptible() as stop, progress(plan.stem, len(prepared.jobs)) as bar:
@@ -84,10 +82,8 @@ def sweep(
             stop=stop,
             on_row=count,
         )
-    if json:
-        emit_json({**asdict(report), "complete": report.complete})
-    else:
-        echo(*_report_lines(report))
+    facts = {**asdict(report), "complete": report.complete}
+    emit(facts, _report_lines(report), as_json=json)
     return 0 if report.complete and report.failed < report.planned else 1
 
 

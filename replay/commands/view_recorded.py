@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from undulog import capture
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
-from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
+from undulog.capture.common.console import echo, emit, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
@@ -110,14 +110,9 @@ def _report_clip(clip: Path, shot: Shot, frames: int, recording: Recording, *, j
         "size": list(shot.size),
         "warnings": list(recording.warnings),
     }
-    if json:
-        emit_json(facts)
-        return
-    echo(
-        f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
-        f"{facts['bytes'] / 1e6:.2f} MB"
-    )
-    echo(*(f"note: {warning}" for warning in recording.warnings))
+    size = f"{shot.size[0]}x{shot.size[1]}, {facts['bytes'] / 1e6:.2f} MB"
+    lines = [f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {size}"]
+    emit(facts, [*lines, *(f"note: {text}" for text in recording.warnings)], as_json=json)
 
 
 def view_overlay(
@@ -179,27 +174,23 @@ def view_overlay(
 
 
 def _report_overlay(beside: Overlay, how: Align, place: Place, *, saved: bool, json: bool) -> None:
-    size = beside.path.stat().st_size
-    if json:
-        facts = {
-            "path": str(beside.path),
-            "bytes": size,
-            "recording_id": beside.recording_id,
-            "align": str(how),
-            "place": str(place),
-            "sessions": [_session(beside, k) for k in range(len(beside.shown))],
-            "warnings": list(beside.warnings),
-        }
-        emit_json(facts)
-        return
     from ..overlay import layout as words
 
+    size = beside.path.stat().st_size
+    facts = {
+        "path": str(beside.path),
+        "bytes": size,
+        "recording_id": beside.recording_id,
+        "align": str(how),
+        "place": str(place),
+        "sessions": [_session(beside, k) for k in range(len(beside.shown))],
+        "warnings": list(beside.warnings),
+    }
     first, *others = [one.side for one in beside.shown]
-    for other in others:
-        echo(f"{words.answer(first, other, beside.found[other.name])}.")
+    lines = [f"{words.answer(first, other, beside.found[other.name])}." for other in others]
     if saved:
-        echo(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
-    echo(*(f"note: {warning}" for warning in beside.warnings))
+        lines.append(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+    emit(facts, [*lines, *(f"note: {text}" for text in beside.warnings)], as_json=json)
 
 
 def _session(beside: Overlay, place: int) -> dict[str, Any]:

@@ -335,11 +335,8 @@ class CycleBars:
             )
             self._write_bars(rec, quantity, tracks, palette)
             rec.reset_time()
-            known = (
-                [one.names for one in self._plots[quantity].series]
-                if quantity in self._plots
-                else []
-            )
+            before = self._plots.get(quantity)
+            known = [] if before is None else [one.names for one in before.series]
             plot = Plot(f"{CYCLES}/{quantity.key}", refined(known, [cycle.names]))
             plot.style(rec, palette, steps=True)
             plot.write(rec, clock, tracks)

@@ -309,7 +309,7 @@ class Relay:
                 self._draw(pending)
                 self._end()
         self._draw(pending)
-        if not self.ended and self._sessions and self._silent_s() > SILENCE_S:
+        if not self.ended and self._sessions and time.monotonic() - self._heard_at > SILENCE_S:
             self._end()
 
     def close(self) -> None:
@@ -325,9 +325,6 @@ class Relay:
             return
         self._rec.disconnect()
         self._rec = None
-
-    def _silent_s(self) -> float:
-        return time.monotonic() - self._heard_at
 
     def _begin(self, feed_id: int) -> bool:
         """Switch to a new feed; return False if only the first is drawn."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -36,51 +37,93 @@ if TYPE_CHECKING:
     from ..twin.recording import Recording
 
 
-def drive_armed(
-    driven: MotionSource,
-    on: str,
-    *,
-    robot: Robot | None,
-    duration_s: float | None,
-    output: Path | None,
-    recorder: Path | None,
-    force: bool,
-) -> BusReport:
-    """Drive over a bus, with progress on a terminal.
+@dataclass(frozen=True)
+class BusDrive:
+    """A motion for a bus, as the command line gives it.
 
-    Args:
+    Attributes:
         robot: The robot on the bus; the one that the motion was made for if None.
         duration_s: Duration [s]; that of the motion if None.
+        output: The session to write; a dry run needs none.
         recorder: Control socket of a recorder; that of the only running one if None.
-
-    Returns:
-        The report, also where it ended early.
-
-    Raises:
-        UsageError: If the arguments can't be used, e.g. the robot has no limits.
-        SourceError: If the bus is silent, or the robot can't be driven from its pose.
     """
-    from ..drive.loop import ConsoleWatch
-    from ..drive.over_bus import bus_plan, drive_bus
 
-    if output is None:
-        raise UsageError(
-            "an armed drive is recorded, with every action of the gate: name the session with -o, "
-            "e.g. -o drive.mcap"
-        )
-    recorder = recorder or _only_recorder()
-    plan = bus_plan(driven, on, output, robot, duration_s, recorder=recorder, force=force)
-    console = ConsoleWatch()
-    start = time.monotonic()
-    with interruptible(twice=True) as stop, progress(driven.name, plan.duration_s) as bar:
+    driven: MotionSource
+    on: str
+    robot: Robot | None
+    duration_s: float | None
+    output: Path | None
+    recorder: Path | None
+    force: bool
 
-        def show(tick: BusTick) -> None:
-            note = f"{tick.step.phase}, {speed_text(tick.time_s, start)}"
-            bar.update(min(tick.time_s, plan.duration_s), note)
+    def drive(self) -> BusReport:
+        """Drive over the bus, with progress on a terminal.
 
-        report = drive_bus(plan, stop=stop, on_tick=show, console=console)
-        console.gone()  # output is discarded from here on
-    return report
+        Returns:
+            The report, also where it ended early.
+
+        Raises:
+            UsageError: If the arguments can't be used, e.g. the robot has no limits.
+            SourceError: If the bus is silent, or the robot can't be driven from its pose.
+        """
+        from ..drive.loop import ConsoleWatch
+        from ..drive.over_bus import bus_plan, drive_bus
+
+        if self.output is None:
+            raise UsageError(
+                "an armed drive is recorded, with every action of the gate: name the session with "
+                "-o, e.g. -o drive.mcap"
+            )
+        recorder = self.recorder or _only_recorder()
+        wanted = self.output, self.robot, self.duration_s
+        plan = bus_plan(self.driven, self.on, *wanted, recorder=recorder, force=self.force)
+        console = ConsoleWatch()
+        start = time.monotonic()
+        with interruptible(twice=True) as stop, progress(plan.driven.name, plan.duration_s) as bar:
+
+            def show(tick: BusTick) -> None:
+                note = f"{tick.step.phase}, {speed_text(tick.time_s, start)}"
+                bar.update(min(tick.time_s, plan.duration_s), note)
+
+            report = drive_bus(plan, stop=stop, on_tick=show, console=console)
+            console.gone()  # output is discarded from here on
+        return report
+
+    def dry_run(self, *, as_json: bool) -> int:
+        """Run the motion in the twin, through the gate of the bus, and print the report.
+
+        Args:
+            as_json: Report as one JSON object.
+
+        Returns:
+            The exit code.
+
+        Raises:
+            UsageError: If the arguments can't be used, e.g. the robot has no bus.
+        """
+        from ..drive.dry_run import dry_run, reported, summary_lines
+        from ..drive.over_bus import check_drivable
+
+        if self.recorder is not None:
+            raise UsageError("--recorder is for --arm: a dry run sends nothing")
+        driven = self.driven
+        check_drivable(driven, self.robot or driven.robot)
+        start = time.monotonic()
+        length_s = driven.duration_s if self.duration_s is None else self.duration_s
+        with interruptible() as stop, progress(f"dry run of {driven.name}", length_s) as bar:
+            dry = dry_run(
+                driven,
+                robot=self.robot,
+                duration_s=self.duration_s,
+                output=self.output,
+                force=self.force,
+                stop=stop,
+                on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
+            )
+        hint = ["", f"To send it to {self.on}, the same with --arm and -o SESSION.mcap"]
+        lines = [*summary_lines(dry, output_width()), *(hint if dry.verdict.fit else [])]
+        emit({"on": self.on, **reported(dry)}, lines, as_json=as_json)
+        return 0 if dry.verdict.fit else 1
 
 
 def early_end(report: BusReport) -> int:
@@ -89,55 +132,6 @@ def early_end(report: BusReport) -> int:
         return 0
     complain(f"error: {report.outcome.why}; {report.outcome.ended}")
     return 1
-
-
-def dry_run_on_bus(
-    driven: MotionSource,
-    on: str,
-    *,
-    robot: Robot | None,
-    duration_s: float | None,
-    output: Path | None,
-    recorder: Path | None,
-    force: bool,
-    as_json: bool,
-) -> int:
-    """Run a motion in the twin, through the gate of a bus, and print the report.
-
-    Args:
-        robot: The robot on the bus; the one that the motion was made for if None.
-        duration_s: Duration [s]; that of the motion if None.
-        output: The session to write, or None.
-        as_json: Report as one JSON object.
-
-    Returns:
-        The exit code.
-
-    Raises:
-        UsageError: If the arguments can't be used, e.g. the robot has no bus.
-    """
-    from ..drive.dry_run import dry_run, reported, summary_lines
-    from ..drive.over_bus import check_drivable
-
-    if recorder is not None:
-        raise UsageError("--recorder is for --arm: a dry run sends nothing")
-    check_drivable(driven, robot or driven.robot)
-    start = time.monotonic()
-    length_s = driven.duration_s if duration_s is None else duration_s
-    with interruptible() as stop, progress(f"dry run of {driven.name}", length_s) as bar:
-        dry = dry_run(
-            driven,
-            robot=robot,
-            duration_s=duration_s,
-            output=output,
-            force=force,
-            stop=stop,
-            on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
-        )
-    hint = ["", f"To send it to {on}, the same with --arm and -o SESSION.mcap"]
-    lines = [*summary_lines(dry, output_width()), *(hint if dry.verdict.fit else [])]
-    emit({"on": on, **reported(dry)}, lines, as_json=as_json)
-    return 0 if dry.verdict.fit else 1
 
 
 def _only_recorder() -> Path | None:
@@ -302,16 +296,10 @@ def drive(
         if several:
             return show(_dry_runs(whats, on, described, duration, topic), as_json=json)
         driven = find_motion(what, robot=described, command_topic=topic)
-        given: dict[str, Any] = {
-            "robot": described,
-            "duration_s": duration,
-            "output": output,
-            "recorder": recorder,
-            "force": force,
-        }
+        given = BusDrive(driven, on, described, duration, output, recorder, force)
         if not arm:
-            return dry_run_on_bus(driven, on, as_json=json, **given)
-        report = drive_armed(driven, on, **given)
+            return given.dry_run(as_json=json)
+        report = given.drive()
         emit(report.facts(), report.lines(), as_json=json)
         return early_end(report)
     if arm or recorder is not None or robot is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from undulog.capture.common.arrays import NS
@@ -14,7 +15,7 @@ from undulog.capture.log.messages.frames import FrameArray, identifier_text
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.contract import SourceAddress, SourceCounts, parse_address
-from undulog.capture.sources.events import Tally
+from undulog.capture.sources.events import EventLog, Tally
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..scenario.scenario import LONGEST_S, Scenario
@@ -139,16 +140,7 @@ def drive_bus(
         virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
         epoch_ns = Scenario.epoch_s * NS if lockstep else clock.epoch_ns
-        session = BusSession(
-            plan.output,
-            plan.driven,
-            robot=robot,
-            address=plan.address,
-            clock=link.clock,
-            epoch_ns=epoch_ns,
-            gait_names=gait.names,
-            force=plan.force,
-        )
+        session = BusSession(plan, link.clock, epoch_ns, gait.names)
         opened.callback(session.close)
         session.writer.note("undulog.gate", plan.limits.facts())
         teller = None
@@ -156,11 +148,7 @@ def drive_bus(
             teller = GaitPublisher(plan.recorder, gait.names)
             opened.callback(teller.close)
         publish = _Telling(
-            plan,
-            session,
-            teller,
-            tally=tally,
-            clock=clock,
+            *(plan, session, teller, tally.events, clock),
             simulated_ns=epoch_ns if lockstep else None,
             on_tick=on_tick,
         )
@@ -285,78 +273,76 @@ def _report(
     )
 
 
+@dataclass
 class _Telling:
-    """Publishes the drive to the session, the recorder and the screen."""
+    """Publishes the drive to the session, the recorder and the screen.
 
-    def __init__(
-        self,
-        plan: BusPlan,
-        session: BusSession,
-        teller: GaitPublisher | None,
-        *,
-        tally: Tally,
-        clock: SessionClock,
-        simulated_ns: int | None,
-        on_tick: Callable[[BusTick], None] | None,
-    ) -> None:
-        """Start; ``simulated_ns`` is the time of tick 0 of a robot in lockstep."""
-        self.first_frames: list[str] = []
-        self._plan, self._session, self._teller = plan, session, teller
-        self._events = tally.events
-        self._feedback: Feedback | None = None
-        self._clock, self._simulated_ns, self._on_tick = clock, simulated_ns, on_tick
+    Attributes:
+        simulated_ns: Time of tick 0 of a robot in lockstep.
+        armed: The supervision of the drive, once it is armed.
+    """
+
+    plan: BusPlan
+    session: BusSession
+    teller: GaitPublisher | None
+    events: EventLog
+    clock: SessionClock
+    simulated_ns: int | None
+    on_tick: Callable[[BusTick], None] | None
+    armed: Feedback | None = None
+    first_frames: list[str] = field(default_factory=list[str])
 
     def begin(self) -> None:
-        driven = self._plan.driven
-        text = f"drives {driven.name} ({driven.kind}) on {self._plan.address.text}"
-        self._session.log_event("info", text)
-        if self._teller is not None:
-            self._teller.note(text)
+        driven = self.plan.driven
+        text = f"drives {driven.name} ({driven.kind}) on {self.plan.address.text}"
+        self.session.log_event("info", text)
+        if self.teller is not None:
+            self.teller.note(text)
 
     def tick(self, tick: BusTick) -> None:
         if tick.step.command is not None and not self.first_frames:
             self.first_frames = [_candump(frame) for frame in tick.sent]
-        if self._simulated_ns is None:
-            self._session.write(tick, self._clock.now_ns())
+        if self.simulated_ns is None:
+            self.session.write(tick, self.clock.now_ns())
         else:
-            t_ns = self._simulated_ns + tick.tick * (NS // CONTROL_RATE_HZ)
-            self._session.write(stamped(tick, t_ns), t_ns)
-        for event in self._events.take():
-            self._session.log_event(event.level, event.text)
-        if self._teller is not None:
+            t_ns = self.simulated_ns + tick.tick * (NS // CONTROL_RATE_HZ)
+            self.session.write(stamped(tick, t_ns), t_ns)
+        for event in self.events.take():
+            self.session.log_event(event.level, event.text)
+        if self.teller is not None:
             if tick.step.gait is not None:
-                self._teller.publish(tick.step.gait, time.time_ns())
+                self.teller.publish(tick.step.gait, time.time_ns())
             for level, text in tick.step.remarks:
-                self._teller.note(text, level)
-        if self._on_tick is not None:
-            self._on_tick(tick)
+                self.teller.note(text, level)
+        if self.on_tick is not None:
+            self.on_tick(tick)
 
     def feedback(self, feedback: Feedback | None) -> None:
         """Write the supervision of the drive when it is armed and when it changes."""
-        if feedback is None or feedback == self._feedback:
+        if feedback is None or feedback == self.armed:
             return
-        if self._feedback is not None:
-            self._session.log_event("warn", f"gate: {UNASKED}")
-        self._feedback = feedback
-        self._session.writer.note("undulog.gate.feedback", feedback.facts())
+        if self.armed is not None:
+            self.session.log_event("warn", f"gate: {UNASKED}")
+        self.armed = feedback
+        self.session.writer.note("undulog.gate.feedback", feedback.facts())
 
     def end(self, report: BusReport) -> None:
-        for event in self._events.flush():
-            self._session.log_event(event.level, event.text)
-        self._session.finish(report.outcome, report.remarks())
+        for event in self.events.flush():
+            self.session.log_event(event.level, event.text)
+        self.session.finish(report.outcome, report.remarks())
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}
-            self._session.writer.note("undulog.gate.jitter", facts)
-        if self._teller is not None:
-            name, outcome = self._plan.driven.name, report.outcome
+            self.session.writer.note("undulog.gate.jitter", facts)
+        if self.teller is not None:
+            name, outcome = self.plan.driven.name, report.outcome
             why = f", {outcome.why}" if outcome.why else ""
             level = "error" if outcome.how is DriveEnding.FAULT else "info"
-            self._teller.note(f"drove {name} for {report.gait_s:g} s{why}", level)
+            self.teller.note(f"drove {name} for {report.gait_s:g} s{why}", level)
 
     def failed(self, text: str) -> None:
-        self._session.fail(text)
-        if self._teller is not None:
-            self._teller.note(text, "error")
+        self.session.fail(text)
+        if self.teller is not None:
+            self.teller.note(text, "error")
 
 
 def _candump(frame: FrameArray) -> str:

@@ -58,16 +58,8 @@ from undulog.capture.common.files import is_file
 from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 from undulog.capture.robot.model import Plane, Robot
 
-from ..gait.contract import WALK, GaitTick, Readings
-from ..gait.wave import (
-    Change,
-    IntegratedPhase,
-    PlaneGait,
-    Serpentine,
-    WaveGenerator,
-    WaveState,
-    started,
-)
+from ..gait.contract import WALK, GaitTick, Modulation, Readings
+from ..gait.wave import IntegratedPhase, PlaneGait, Serpentine, WaveGenerator, WaveState, started
 from ..scenario.motion import read_gait
 from ..scenario.scenario import LONGEST_S, Length, Scenario
 from ..scenario.scenario_file import load_scenario, scenario_names
@@ -151,7 +143,7 @@ class _PlannedRhythm:
         self._places = np.arange(joint_count)
         self._phase = IntegratedPhase(gaits[0].phase, float(self._values[0, 3]))
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
+    def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:  # noqa: ARG002
         segment = bisect_right(self._starts, time_s) - 1
         share = started(time_s - self._starts[segment], self._transitions[segment])
         before, after = self._values[segment], self._values[segment + 1]

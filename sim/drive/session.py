@@ -26,14 +26,14 @@ from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.source_clock import SourceClock
-from undulog.capture.robot.model import ClockDomain, Robot
-from undulog.capture.sources.contract import DEVICE_TIMES_END_NS, SourceAddress
+from undulog.capture.robot.model import ClockDomain
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 from ..gait.contract import GaitTick
 from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
-from .motion import MotionSource
 from .outcome import DriveEnding, GateEvent, Outcome
+from .report import BusPlan
 
 _MOST_HELD = 1000
 _AT_ONCE = 64
@@ -136,22 +136,12 @@ class BusSession:
     """
 
     def __init__(
-        self,
-        path: Path,
-        driven: MotionSource,
-        *,
-        robot: Robot,
-        address: SourceAddress,
-        clock: ClockDomain,
-        epoch_ns: int,
-        gait_names: tuple[str, ...],
-        force: bool = False,
+        self, plan: BusPlan, clock: ClockDomain, epoch_ns: int, gait_names: tuple[str, ...]
     ) -> None:
         """Open the session.
 
         Args:
-            robot: The robot on the bus.
-            address: The bus.
+            plan: The motion, the robot, the bus and the file.
             clock: Clock of the frames' device times.
             epoch_ns: Unix time of its start [ns].
             gait_names: Names of the gait's values.
@@ -162,16 +152,16 @@ class BusSession:
             LogWriteError: If it can't be created, or there is no room for it.
             DataError: If the robot has no bus.
         """
-        bus = address.name
+        path, driven, robot, bus = plan.output, plan.driven, plan.robot, plan.address.name
         require_space(path, _ROOM)
-        self._sink = DurableSink(path, force=force, last_words=_LAST_WORDS)
+        self._sink = DurableSink(path, force=plan.force, last_words=_LAST_WORDS)
         self.writer = SessionWriter(
             path,
             session_id=uuid.uuid4().hex,
             epoch_ns=epoch_ns,
             robot=robot,
             clock={bus: clock},
-            metadata={**driven.facts, "armed": "yes", f"source.{bus}": address.text},
+            metadata={**driven.facts, "armed": "yes", f"source.{bus}": plan.address.text},
             sink=self._sink,
         )
         self.writer.explain(driven.attachments, driven.records)

@@ -93,7 +93,7 @@ class Gait(Protocol):
 
 @dataclass(frozen=True)
 class Modulation:
-    """Changes of a generator from one tick on; they may jump, the phase does not.
+    """Changes of a generator, or of one plane, from one tick on; they may jump, the phase does not.
 
     Attributes:
         amplitude_factor: Multiplies each joint's amplitude, shape (m,).

@@ -27,8 +27,8 @@ from undulog.capture.common.config import NonNegative
 from undulog.capture.common.strict_table import at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
-from .contract import Readings
-from .wave import Change, Frequency, IntegratedPhase, Wave, WaveGenerator, WaveState, started
+from .contract import Modulation, Readings
+from .wave import Frequency, IntegratedPhase, Wave, WaveGenerator, WaveState, started
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class _DelayRhythm:
         self._history = DelayedPhase(line.phase, self._omega, float(self._delays.max()))
         self._sign = -1.0 if line.wave is Wave.HEAD_TO_TAIL else 1.0
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
+    def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:  # noqa: ARG002
         line = self._line
         omega = self._omega * change.frequency_factor
         self._history.advance(time_s, omega)

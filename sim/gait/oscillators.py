@@ -40,8 +40,8 @@ from undulog.capture.common.config import NonNegative
 from undulog.capture.common.strict_table import above, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
-from .contract import CONTROL_RATE_HZ, Readings
-from .wave import Change, IntegratedPhase, PlaneGait, WaveGenerator, WaveState
+from .contract import CONTROL_RATE_HZ, Modulation, Readings
+from .wave import IntegratedPhase, PlaneGait, WaveGenerator, WaveState
 
 _State = TypeVar("_State", FloatArray, ComplexArray)
 
@@ -373,7 +373,7 @@ class _OscillatorRhythm:
         self._time_s, self._factor = 0.0, 1.0
         self._felt, self._steady = np.zeros(n), np.zeros(n)
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:
+    def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:
         chain, elapsed = self._chain, time_s - self._time_s
         self._turn(elapsed)
         self._kick(time_s)

@@ -66,19 +66,6 @@ def within_limits(
     return np.minimum(np.maximum(amplitude, -room), room), offset
 
 
-class Change(NamedTuple):
-    """The part of a :class:`~.sim.gait.contract.Modulation` that concerns one plane.
-
-    Attributes:
-        amplitude_factor: Multiplies each joint's amplitude, shape (n,).
-        offset: Added to each joint's offset [rad], shape (n,).
-    """
-
-    amplitude_factor: FloatArray
-    offset: FloatArray
-    frequency_factor: float
-
-
 class WaveState(NamedTuple):
     """Wave of the n joints of a plane from one tick on: A sin(phase) + Y.
 
@@ -100,7 +87,7 @@ class WaveState(NamedTuple):
 class Rhythm(Protocol):
     """One plane's generator of phases, amplitudes and offsets."""
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:
+    def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:
         """Return the wave from a time on.
 
         Args:
@@ -277,7 +264,7 @@ class WaveGenerator:
         clamped: list[str] = []
         for part in self._parts:
             joints = part.joints
-            change = Change(
+            change = Modulation(
                 modulation.amplitude_factor[joints],
                 modulation.offset[joints],
                 modulation.frequency_factor,
@@ -347,7 +334,7 @@ class _SerpentineRhythm:
         self._phase = IntegratedPhase(wave.phase, self._omega)
         self._lags = np.arange(joint_count, dtype=np.float64) * wave.signed_lag
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
+    def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:  # noqa: ARG002
         wave, ramp = self._wave, started(time_s, self._ramp_s)
         omega = self._omega * change.frequency_factor
         return WaveState(

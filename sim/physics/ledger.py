@@ -25,9 +25,8 @@ from __future__ import annotations
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.robot.model import Robot
 
-from ..scenario.scenario import Kernels
+from ..scenario.scenario import Kernels, Scenario
 from .contact import cross, into_frames, into_link_axes
 from .engine import BodyState
 from .servo import COULOMB_SPEED, Servos
@@ -183,32 +182,16 @@ TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + PUSH_TERMS + STORED_TERMS 
 class Ledger:
     """Adds up flows and reads off stored energies."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        servos: Servos,
-        *,
-        gravity: FloatArray,
-        stiffness: float,
-        obstacle_stiffness: float,
-        dt: float,
-        start: Step,
-        kernels: Kernels = Kernels.NUMPY,
-    ) -> None:
-        """Open the ledger.
-
-        Args:
-            gravity: Acceleration of gravity in the world [m/s^2], shape (3,).
-            stiffness: Of the ground [N/m], 0 where there is none.
-            obstacle_stiffness: Of the obstacles [N/m].
-            dt: Step [s].
-            start: The state at which all flows are zero.
-        """
+    def __init__(self, scenario: Scenario, servos: Servos, start: Step, kernels: Kernels) -> None:
+        """Open the ledger at the state at which all flows are zero."""
+        robot, world = scenario.robot, scenario.world
         self._kernels, self._servos = kernels, servos
         self._mass = np.array([link.mass for link in robot.links])
         self._inertia = np.array([link.inertia for link in robot.links]).T.copy()
-        self._gravity, self._stiffness = gravity, stiffness
-        self._obstacle_stiffness, self._dt = obstacle_stiffness, dt
+        self._gravity = np.array(world.gravity)
+        self._stiffness = world.ground.stiffness if world.ground is not None else 0.0
+        self._obstacle_stiffness = world.obstacle_contact.stiffness
+        self._dt = 1.0 / scenario.physics_rate_hz
         self._joints = np.zeros((len(JOINT_TERMS), len(robot.joints)))
         self._ground = np.zeros(len(GROUND_TERMS))
         self._obstacles = np.zeros(len(OBSTACLE_TERMS))

@@ -10,8 +10,9 @@ touches obstacles differs in number from step to step, so it is kept beside the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, Protocol, overload
+from typing import NamedTuple, Protocol, TypeAlias, overload
 
 import numpy as np
 
@@ -35,6 +36,7 @@ class Step(NamedTuple):
     obstacles: ObstacleContact = NO_CONTACT
 
 
+@dataclass(eq=False)
 class Steps(Sequence[Step]):
     """Consecutive steps.
 
@@ -46,28 +48,15 @@ class Steps(Sequence[Step]):
         pushes: Forces on the links' centres from outside [N], shape (k, 3, n); None for none.
     """
 
-    def __init__(
-        self,
-        table: FloatArray,
-        link_count: int,
-        joint_count: int,
-        obstacles: list[ObstacleContact] | None = None,
-        pushes: FloatArray | None = None,
-    ) -> None:
-        """Wrap a table.
+    table: FloatArray
+    link_count: int
+    joint_count: int
+    obstacles: list[ObstacleContact] = field(default_factory=list[ObstacleContact])
+    pushes: FloatArray | None = None
 
-        Args:
-            table: One row a step, shape (k, 22 n + 7 m).
-            link_count: n.
-            joint_count: m.
-            obstacles: What touches obstacles, one entry a step; nothing by default.
-            pushes: Forces on the links' centres from outside [N], shape (k, 3, n).
-        """
-        self.table = table
-        self.pushes = pushes
-        self.obstacles = [NO_CONTACT] * len(table) if obstacles is None else obstacles
-        self.link_count = link_count
-        self.joint_count = joint_count
+    def __post_init__(self) -> None:
+        """Have nothing touch an obstacle by default."""
+        self.obstacles = self.obstacles or [NO_CONTACT] * len(self.table)
 
     @classmethod
     def empty(cls, count: int, link_count: int, joint_count: int) -> Steps:
@@ -80,28 +69,29 @@ class Steps(Sequence[Step]):
         """
         return cls(np.zeros((count, 22 * link_count + 7 * joint_count)), link_count, joint_count)
 
+    @cached_property
+    def _views(self) -> _Parts:
+        return _parts(self.table, self.link_count, self.joint_count)
+
     @property
     def links(self) -> FloatArray:
         """The links' fields of :class:`.sim.physics.engine.BodyState`, a view, shape (k, 13, n)."""
-        return self.table[:, : 13 * self.link_count].reshape(-1, 13, self.link_count)
+        return self._views[0]
 
     @property
     def motion(self) -> FloatArray:
         """Joint angles and rates of all steps, a view, shape (k, 2, m)."""
-        start, m = 13 * self.link_count, self.joint_count
-        return self.table[:, start : start + 2 * m].reshape(-1, 2, m)
+        return self._views[1]
 
     @property
     def touch(self) -> FloatArray:
         """All of :class:`.sim.physics.contact.Contact` of all steps, a view, shape (k, 9, n)."""
-        start, n = 13 * self.link_count + 2 * self.joint_count, self.link_count
-        return self.table[:, start : start + 9 * n].reshape(-1, 9, n)
+        return self._views[2]
 
     @property
     def motors(self) -> FloatArray:
         """The rotors' and then the drives' fields of all steps, a view, shape (k, 5, m)."""
-        m = self.joint_count
-        return self.table[:, 22 * self.link_count + 2 * m :].reshape(-1, 5, m)
+        return self._views[3]
 
     @property
     def drives(self) -> FloatArray:
@@ -143,14 +133,23 @@ class Steps(Sequence[Step]):
         return _fields(self.table, self.link_count, self.joint_count)
 
 
+_Parts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _parts(table: FloatArray, n: int, m: int) -> _Parts:
+    """Links, joints, touch and motors of rows, shape (..., width), as views."""
+    lead, acting, servos = table.shape[:-1], 13 * n + 2 * m, 22 * n + 2 * m
+    return (
+        table[..., : 13 * n].reshape(*lead, 13, n),
+        table[..., 13 * n : acting].reshape(*lead, 2, m),
+        table[..., acting:servos].reshape(*lead, 9, n),
+        table[..., servos:].reshape(*lead, 5, m),
+    )
+
+
 def _fields(table: FloatArray, n: int, m: int) -> Step:
     """The fields of rows, shape (..., width), as views."""
-    lead, width = table.shape[:-1], table.shape[-1]
-    acting, servos = 13 * n + 2 * m, width - 5 * m
-    links = table[..., : 13 * n].reshape(*lead, 13, n)
-    joints = table[..., 13 * n : acting].reshape(*lead, 2, m)
-    touch = table[..., acting:servos].reshape(*lead, 9, n)
-    motors = table[..., servos:].reshape(*lead, 5, m)
+    links, joints, touch, motors = _parts(table, n, m)
     return Step(
         BodyState(
             *(links[..., :3, :], links[..., 3:7, :], links[..., 7:10, :], links[..., 10:, :]),

@@ -210,18 +210,13 @@ def _ground_parts(
     )
     slip = slip.copy()
     slip[:, [_OTHER]] = other
-    if plane is Plane.HORIZONTAL:
-        mu, drag, name = ground.mu_normal, ground.drag_normal, "world.ground.drag_normal"
-    else:
-        mu, drag, name = (
-            ground.mu_tangential,
-            ground.drag_tangential,
-            "world.ground.drag_tangential",
-        )
+    way = "normal" if plane is Plane.HORIZONTAL else "tangential"
+    mu, drag = (float(getattr(ground, f"{kind}_{way}")) for kind in ("mu", "drag"))
+    if plane is Plane.VERTICAL:
         yield _Part("world.ground.stiffness", dt**2 * ground.stiffness * one, shift)
         yield _Part("world.ground.damping", 2 * dt * ground.damping * one, shift)
     if ground.law is FrictionLaw.VISCOUS:
-        yield _Part(name, 2 * dt * drag * one, slip)
+        yield _Part(f"world.ground.drag_{way}", 2 * dt * drag * one, slip)
     else:
         load = np.array([link.mass for link in robot.links]) * max(-scenario.world.gravity[2], 0.0)
         yield _Part("world.ground.slip_speed", 2 * dt * mu * load / ground.slip_speed, slip)

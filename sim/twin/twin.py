@@ -194,11 +194,7 @@ class Twin:
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        gait: Gait | None = None,
-        *,
-        kernels: Kernels = Kernels.NUMPY,
+        self, scenario: Scenario, gait: Gait | None = None, *, kernels: Kernels = Kernels.NUMPY
     ) -> None:
         """Set the robot on the ground, straight, its servos at rest, in vertical balance.
 
@@ -210,23 +206,13 @@ class Twin:
             UsageError: If the engine cannot hold the robot.
             ImportError: If the engine or the kernels are not installed.
         """
-        robot, world = scenario.robot, scenario.world
         self.scenario = scenario
         self.kernels = kernels
         self.gait: Gait = gait or build_gait(scenario)
         self.sensed: list[SensorSample] = []
         self._sensing = Senses(scenario)
         self._plant = Plant(scenario, kernels)
-        self._ledger = Ledger(
-            robot,
-            self._plant.servos,
-            gravity=np.array(world.gravity),
-            stiffness=world.ground.stiffness if world.ground is not None else 0.0,
-            obstacle_stiffness=world.obstacle_contact.stiffness,
-            dt=self._plant.dt,
-            start=self._plant.now,
-            kernels=kernels,
-        )
+        self._ledger = Ledger(scenario, self._plant.servos, self._plant.now, kernels)
 
     def __enter__(self) -> Self:
         """Enter the block that owns the physics world."""

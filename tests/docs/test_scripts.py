@@ -12,11 +12,8 @@ DOCS = ROOT / "docs"
 RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py", "result_schemas.py"}
 """Run by Sphinx (``make docs``), the others by tests of their own, too."""
 
-PICTURES = {"pictures.py", "side_by_side.py"}
-"""Need the viewer's driver."""
-
-OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "real_robots.py"}
-TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - PICTURES - OWN_TESTS)
+OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "pictures.py", "real_robots.py"}
+TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - OWN_TESTS)
 
 pytestmark = pytest.mark.slow
 
@@ -57,9 +54,8 @@ def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, command):
     command("report", session, "-o", page)
     images = tmp_path / "images"
     printed(DOCS / "pictures.py", tmp_path, images, "--quick")
-    assert names(images) == {"clip.gif", "replay-mean-cycle.png", "response.svg"}
-    printed(DOCS / "side_by_side.py", images, "--quick")
-    assert names(images) <= names(DOCS / "images")
+    drawn = {"clip.gif", "replay-mean-cycle.png", "response.svg", "side-by-side.png"}
+    assert names(images) == drawn <= names(DOCS / "images")
 
 
 def names(folder):

@@ -15,7 +15,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.replay.calibrate.identifiability import ridges
 from undulog.replay.calibrate.lack_of_fit import misfit
 from undulog.replay.calibrate.parameters import Unknown
-from undulog.replay.calibrate.solve import memory, score_covariance, solve
+from undulog.replay.calibrate.solve import LeastSquares, memory, solve
 from undulog.replay.commands import fit as cli
 from undulog.sim.scenario.scenario_file import load_scenario
 
@@ -217,7 +217,8 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
     n, w = 40000, 2 * np.pi * 0.01
     noise = colored(np.random.default_rng(4), rho, n)
-    got = score_covariance([np.cos(w * np.arange(n))[:, None]], [noise], np.ones(1), np.ones(1))
+    column = np.cos(w * np.arange(n))[:, None]
+    got = LeastSquares([column], [noise], np.ones(1), np.ones(1)).scores()
     spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
 
