@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -102,19 +102,19 @@ class LossTally:
         ]
 
 
-@dataclass
+@dataclass(frozen=True)
 class ExportReport:
-    """Result of an export of frames.
+    """Result of an export.
 
     Attributes:
-        title: Name of the format.
-        buses: Bus to number of frames written.
+        what: What was written, as a phrase.
+        facts: The same for JSON.
         warnings: Facts that the format doesn't hold or the session lacks, one sentence each.
     """
 
-    title: str
-    buses: dict[str, int]
-    warnings: list[str] = field(default_factory=list[str])
+    what: str
+    facts: dict[str, Any]
+    warnings: list[str]
 
 
 def export_log(
@@ -166,7 +166,9 @@ def export_log(
         elif left_out := sum(facts.fd_counts.values()):
             warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
         warnings += tally.sentences()
-    return ExportReport(chosen.title, counts, warnings)
+    total = sum(counts.values())
+    what = f"{total} frames of {', '.join(counts)}, in the format of {chosen.title}"
+    return ExportReport(what, {"frames": total, "buses": counts}, warnings)
 
 
 def chosen_format(
@@ -184,20 +186,6 @@ def chosen_format(
 
 _MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
-
-
-@dataclass
-class ColumnReport:
-    """Result of an export of columns.
-
-    Attributes:
-        rows: Topic to number of rows.
-        warnings: Missing or doubtful facts, one sentence each.
-    """
-
-    columns: list[str]
-    rows: dict[str, int] = field(default_factory=dict[str, int])
-    warnings: list[str] = field(default_factory=list[str])
 
 
 @dataclass(frozen=True)
@@ -227,7 +215,7 @@ def export_columns(
     topics: Sequence[str] = (),
     force: bool = False,
     stop: StopRequest | None = None,
-) -> ColumnReport:
+) -> ExportReport:
     """Write joint columns of a session as a table.
 
     One topic is held in memory at a time.
@@ -257,24 +245,23 @@ def export_columns(
             )
         wanted = {topic: joint_fields(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
-        report = ColumnReport(["t_ns", "topic", "joint", *columns])
+        rows = dict.fromkeys(wanted, 0)
+        warnings = [f"{topic} carries no values" for topic, found in wanted.items() if not found]
         with (
             part_file(output) as part,
             progress(f"export {output.name}", len(wanted)) as bar,
             open_table(part, columns) as write,
         ):
             for number, (topic, found) in enumerate(wanted.items()):
-                report.rows[topic] = 0
-                if not found:
-                    report.warnings.append(f"{topic} carries no values")
-                    continue
-                for block, done in _blocks(session, topic, found):
+                for block, done in _blocks(session, topic, found) if found else ():
                     write(block)
-                    report.rows[topic] += len(block.t_ns)
+                    rows[topic] += len(block.t_ns)
                     bar.update(number + done)
                     check_stop(output, stop)
-        report.warnings += session.warnings
-    return report
+        warnings += session.warnings
+    total = sum(rows.values())
+    what = f"{total} rows of {', '.join(rows)}"
+    return ExportReport(what, {"rows": total, "topics": rows}, warnings)
 
 
 @contextmanager
