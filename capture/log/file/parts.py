@@ -58,12 +58,8 @@ def later_parts(first: Path) -> list[Path]:
     Raises:
         OSError: If the folder can't be listed.
     """
-    found: list[tuple[int, Path]] = []
-    for path in first.parent.iterdir():
-        head, number = split_part_path(path)
-        if number > 1 and head == first:
-            found.append((number, path))
-    return [path for _, path in sorted(found)]
+    names = [(*split_part_path(path), path) for path in first.parent.iterdir()]
+    return [path for head, number, path in sorted(names) if number > 1 and head == first]
 
 
 _MOST_LISTED = 20
@@ -253,12 +249,11 @@ def _redefines(file: McapFile, others: list[McapFile]) -> bool:
 
 
 def _kinds(file: McapFile) -> list[tuple[int, tuple[str, str, bytes]]]:
-    kinds: list[tuple[int, tuple[str, str, bytes]]] = []
-    for key, channel in file.channels.items():
-        schema = file.schemas.get(channel.schema_id)
-        kind = (channel.topic, schema.name, schema.data) if schema else (channel.topic, "", b"")
-        kinds.append((key, kind))
-    return kinds
+    types = {key: (schema.name, schema.data) for key, schema in file.schemas.items()}
+    return [
+        (key, (channel.topic, *types.get(channel.schema_id, ("", b""))))
+        for key, channel in file.channels.items()
+    ]
 
 
 def _part_record(file: McapFile) -> dict[str, str]:

@@ -243,11 +243,11 @@ class SourceHealth:
 
     name: str
     frames: int
-    dropped: int | None
-    malformed: int
-    error_frames: int
-    reconnects: int
-    clock_resets: int
+    dropped: int | None = None
+    malformed: int = 0
+    error_frames: int = 0
+    reconnects: int = 0
+    clock_resets: int = 0
 
 
 def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, ...]:
@@ -301,17 +301,7 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
             for key in _COUNTS
             if key in status.values
         }
-        found.append(
-            SourceHealth(
-                name=status.name.removeprefix(SOURCE_PREFIX),
-                frames=counts["frames"],
-                dropped=counts.get("dropped"),
-                malformed=counts.get("malformed", 0),
-                error_frames=counts.get("error_frames", 0),
-                reconnects=counts.get("reconnects", 0),
-                clock_resets=counts.get("clock_resets", 0),
-            )
-        )
+        found.append(SourceHealth(status.name.removeprefix(SOURCE_PREFIX), **counts))
     return tuple(sorted(found, key=lambda source: source.name))
 
 
