@@ -24,7 +24,7 @@ from mcap.records import Attachment, Channel, Metadata
 from ..common.arrays import NS
 from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, LogError, UndulogError, UsageError
-from ..common.files import part_file
+from ..common.files import Closing, part_file
 from ..common.process import StopRequest
 from ..common.strict_table import read_toml
 from .file.log_file import LogFile
@@ -54,7 +54,7 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class RawLog:
+class RawLog(Closing):
     """A log opened for its bytes; ``with`` releases it."""
 
     def __init__(self, path: Path) -> None:
@@ -78,11 +78,7 @@ class RawLog:
         self.session_id = self.file.session_id
         self.robot = _robot_name(self.file)
 
-    def __enter__(self) -> RawLog:
-        """Return the log."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Release the file."""
         self.file.close()
 

@@ -120,7 +120,7 @@ class SessionView(SessionFacts):
         Raises:
             DataError: If the topic has no joints.
         """
-        return self.channels.get(name) or self._log.joint_channel(name)
+        return self.channels.get(name) or self._log.joints.channel(name)
 
     def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
         """Return the fields that a topic ever has, each with its joints in order of appearance.
@@ -129,7 +129,7 @@ class SessionView(SessionFacts):
             MissingChannelError: If the session has no such topic.
             DataError: If it has no joints.
         """
-        return self._log.joint_fields(self._logged(name))
+        return self._log.joints.carried(self._logged(name))
 
     def joint_messages(
         self,
@@ -154,7 +154,7 @@ class SessionView(SessionFacts):
         """
         self._on_read()
         logged = {self._logged(topic): fields for topic, fields in wanted.items()}
-        found = self._log.joint_messages(logged, self._within(start_ns, stop_ns))
+        found = self._log.joints.logged(logged, self._within(start_ns, stop_ns))
         return {
             (topic, field): found[self._logged(topic), field]
             for topic, fields in wanted.items()
@@ -225,7 +225,7 @@ class SessionView(SessionFacts):
         found = {
             name: replace(channel, topic=name)
             for name, topic in self._names.items()
-            if (channel := logged.get(topic) or self._log.joint_channel(topic)) is not None
+            if (channel := logged.get(topic) or self._log.joints.channel(topic)) is not None
         }
         found |= {topic: channel for topic, channel in logged.items() if topic not in away}
         return MappingProxyType(found)
@@ -308,7 +308,7 @@ class SessionView(SessionFacts):
         logged: dict[str, list[str]] = {}
         for topic, fields in wanted.items():
             logged.setdefault(self._logged(topic), []).extend(fields)
-        found = self._log.joints(logged, self._within(start_ns, stop_ns))
+        found = self._log.joints.read(logged, self._within(start_ns, stop_ns))
         return {
             (topic, field): found[self._logged(topic), field]
             for topic, fields in wanted.items()
