@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
-from ..common.errors import MissingChannelError, MissingExtraError, UsageError
+from ..common.errors import MissingChannelError, UsageError
 from ..common.files import as_text, check_stop, csv_writer, number_cells, part_file
 from ..common.process import StopRequest
 from ..log.messages.definitions import JOINT_STATE
@@ -41,6 +41,7 @@ from ..log.messages.frames import (
 from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
+from .column_blocks import arrow
 from .frame_formats import FRAME_FORMATS
 from .frame_log import LogBlock, chosen_buses, frame_blocks, frame_facts, is_error, is_remote
 
@@ -290,17 +291,14 @@ def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
 @contextmanager
 def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
     """Parquet: t_ns int64, topic and joint dictionaries of strings, the rest float64 or null."""
-    try:
-        import pyarrow as pa
-        from pyarrow.parquet import ParquetWriter
-    except ImportError as error:
-        raise MissingExtraError("a .parquet table", "parquet", "pyarrow") from error
+    parquet = arrow("a .parquet table")
+    import pyarrow as pa
+
     module: Any = pa  # its types are incomplete
     text = module.dictionary(module.int32(), module.string())
     fields: list[Any] = [("t_ns", module.int64()), ("topic", text), ("joint", text)]
     schema = module.schema([*fields, *((name, module.float64()) for name in columns)])
-    with ParquetWriter(path, schema) as table:
-        writer: Any = table
+    with parquet.ParquetWriter(path, schema) as writer:
 
         def write(block: RowBlock) -> None:
             count = len(block.t_ns)

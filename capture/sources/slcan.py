@@ -19,12 +19,10 @@ import fcntl
 import os
 import re
 import select
-import stat
 import termios
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 from ..common.errors import SourceError, UsageError
 from ..log.messages.frames import (
@@ -50,6 +48,7 @@ from .contract import (
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
+from .serial_port import bauds, check_device, make_raw
 
 STAMP_PERIOD_MS = 60_000
 """An adapter's time stamps start again after so many milliseconds."""
@@ -285,7 +284,8 @@ def open_slcan(path: str, settings: SlcanSettings, tally: Tally) -> SlcanLink:
     """
     fileno = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _make_raw(fileno, settings)
+        make_raw(fileno, settings.tty_baud, termios.CRTSCTS if settings.rtscts else 0)
+        termios.tcflush(fileno, termios.TCIOFLUSH)
         fcntl.ioctl(fileno, termios.TIOCEXCL)  # a second reader would take half of the bytes
         _write(fileno, b"\r\r\rC\r")  # whatever it was in the middle of
         _settle(fileno)
@@ -333,11 +333,9 @@ def slcan_source(address: SourceAddress, path: str) -> LinkedSource:
     if settings.bitrate is not None:
         _check_option(address, "bitrate", settings.bitrate, sorted(BITRATES))
         facts["bitrate"] = str(settings.bitrate)
-    _check_option(address, "tty_baud", settings.tty_baud, _speeds())
+    _check_option(address, "tty_baud", settings.tty_baud, bauds())
     facts["timestamps"] = "adapter, 1 ms" if settings.timestamps else "host"
-    device = Path(path)
-    if device.exists() and not stat.S_ISCHR(device.stat().st_mode):
-        raise SourceError(address.text, f"{path} is no serial device")
+    check_device(address.text, path)
     return LinkedSource(
         address,
         lambda tally: DrainedLink(open_slcan(path, settings, tally), tally, pause_s=_PAUSE_S),
@@ -351,26 +349,6 @@ def _check_option(address: SourceAddress, key: str, value: int, valid: list[int]
     if value not in valid:
         listed = ", ".join(map(str, valid))
         raise UsageError(f"{address.text!r}: {key} {value} is not one of {listed}")
-
-
-def _speeds() -> list[int]:
-    names = [name[1:] for name in dir(termios) if name.startswith("B") and name[1:].isdigit()]
-    return sorted(int(name) for name in names if name != "0")
-
-
-def _make_raw(fileno: int, settings: SlcanSettings) -> None:
-    attributes = termios.tcgetattr(fileno)
-    flags = termios.CS8 | termios.CREAD | termios.CLOCAL
-    if settings.rtscts:
-        flags |= termios.CRTSCTS
-    speed = getattr(termios, f"B{settings.tty_baud}")
-    characters = attributes[6]
-    characters[termios.VMIN] = 1  # so that an empty read means that it hung up
-    characters[termios.VTIME] = 0
-    termios.tcsetattr(
-        fileno, termios.TCSANOW, [termios.IGNBRK, 0, flags, 0, speed, speed, characters]
-    )
-    termios.tcflush(fileno, termios.TCIOFLUSH)
 
 
 def _write(fileno: int, data: bytes) -> None:
