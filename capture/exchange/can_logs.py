@@ -35,7 +35,7 @@ from can.io.blf import (
     BLFParseError,
 )
 
-from ..common.errors import ImportFormatError
+from ..common.errors import ImportFormatError, raised_as
 from ..common.files import is_file
 from ..log.messages.frames import (
     DIR_RX,
@@ -228,14 +228,12 @@ def log_suffix(path: Path) -> str:
 def _reader(path: Path) -> MessageReader:
     from can import LogReader
 
-    try:
+    with raised_as(ImportFormatError, path, "can't be read", *_READ_ERRORS):
         if log_suffix(path) == ".blf":
             return CheckedBLFReader(path)
         if log_suffix(path) == ".db":
             _check_database(path)
         return LogReader(path)
-    except _READ_ERRORS as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
 def _check_database(path: Path) -> None:
@@ -271,10 +269,8 @@ def _python_can_log(
 
 def _lines(path: Path, stream: TextIO) -> Iterator[str]:
     """Yield the lines of a text; errors name the file."""
-    try:
+    with raised_as(ImportFormatError, path, "can't be read", OSError, EOFError):  # a damaged .gz
         yield from stream
-    except (OSError, EOFError) as error:  # a damaged .gz, above all
-        raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
 def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:

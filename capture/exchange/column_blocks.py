@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError, LogError, MissingExtraError
+from ..common.errors import ImportFormatError, MissingExtraError, raised_as
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
@@ -153,7 +153,8 @@ def read_parquet(
         MissingExtraError: If pyarrow is not installed.
     """
     parquet = arrow("a .parquet table")
-    try:
+    # pyarrow has errors of many bases
+    with raised_as(ImportFormatError, path, "can't be read as Parquet", Exception):
         with parquet.ParquetFile(path) as file:
             names = Counter(cast("list[str]", file.schema_arrow.names))
             for name in names if columns is None else columns:
@@ -168,10 +169,6 @@ def read_parquet(
             columns=columns, filter=dataset.field(where[0]) == where[1],
             batch_size=rows, batch_readahead=1, fragment_readahead=1,
         )  # fmt: skip
-    except LogError:
-        raise
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
 
 
 def block_of(batch: Any) -> Block:
