@@ -77,8 +77,8 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """
     faults = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
     with (
+        raised_as(ImportFormatError, path, "is no zip by torch.save", *UNZIPPING),
         raised_as(ImportFormatError, path, "is no file of tensors by torch.save", *faults),
-        raised_as(ImportFormatError, path, "is no zip by torch.save", *UNZIPPING, RecursionError),
         zipfile.ZipFile(path) as archive,
     ):
         (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))

@@ -218,9 +218,8 @@ def _held(
     return HeldSignal(joint, t_ns if known.all() else t_ns[known], rounded)
 
 
-def _losses(episode: Episode, fps: int) -> list[str]:
-    """Return what a rate of frames leaves out, one sentence a feature."""
-    sentences: list[str] = []
+def _losses(episode: Episode, fps: int) -> Iterator[str]:
+    """Yield what a rate of frames leaves out, one sentence a feature."""
     frame_ns = episode.frame_ns(np.arange(_checked(episode, fps)), fps)
     for name, signals in episode.features.items():
         total = sum(len(signal.t_ns) for signal in signals)
@@ -231,11 +230,10 @@ def _losses(episode: Episode, fps: int) -> list[str]:
             age_ns = int((frame_ns - signal.t_ns[last]).max())
             if age_ns > oldest_ns:
                 oldest_ns, joint = age_ns, signal.joint
-        sentences.append(
+        yield (
             f"{name} at {fps} frames a second: {total - kept} of {total} samples left out, values "
             f"up to {oldest_ns / NS:.3g} s old ({joint}), rounded to float32"
         )
-    return sentences
 
 
 def _checked(episode: Episode, fps: int) -> int:

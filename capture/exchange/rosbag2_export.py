@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -168,17 +169,16 @@ def _metadata(log: RawLog, channels: list[Channel], copy: EditedLog, file: str) 
     return "\n".join(_yaml({"rosbag2_bagfile_information": facts})) + "\n"
 
 
-def _yaml(value: Any, indent: str = "") -> list[str]:
-    """Return the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
-    lines: list[str] = []
+def _yaml(value: Any, indent: str = "") -> Iterator[str]:
+    """Yield the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
     if isinstance(value, list):
         for item in cast("list[Any]", value):
-            own = _yaml(item, indent + "  ") if isinstance(item, dict) else [json.dumps(item)]
-            lines += [f"{indent}- {own[0].strip()}", *own[1:]]
-        return lines
+            own = [*_yaml(item, indent + "  ")] if isinstance(item, dict) else [json.dumps(item)]
+            yield from (f"{indent}- {own[0].strip()}", *own[1:])
+        return
     for key, item in cast("dict[str, Any]", value).items():
         if item and isinstance(item, dict | list):
-            lines += [f"{indent}{key}:", *_yaml(item, indent + "  ")]
+            yield f"{indent}{key}:"
+            yield from _yaml(item, indent + "  ")
         else:
-            lines.append(f"{indent}{key}: {json.dumps(item)}")
-    return lines
+            yield f"{indent}{key}: {json.dumps(item)}"

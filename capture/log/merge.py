@@ -318,23 +318,21 @@ def _definition(schema: Schema) -> object:
     return schema.data
 
 
-def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
+def _other_robots(sources: Sequence[RawLog], robot: str) -> Iterator[str]:
     """Warn of logs that are not, or probably not, of the merged session's robot."""
-    warnings = [
-        f"{source.path} is of {source.robot}, not of {robot}: its messages are merged all the same"
-        for source in sources
-        if source.robot and source.robot != robot
-    ]
+    for source in sources:
+        if source.robot and source.robot != robot:
+            fact = f"{source.path} is of {source.robot}, not of {robot}"
+            yield f"{fact}: its messages are merged all the same"
     joints = [(source, _joint_names(source)) for source in sources]
     for (one, names), (other, others) in combinations(joints, 2):
         unstated = not one.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
             here, there = (some_names(sorted(each), 3) for each in (names, others))
-            warnings.append(
+            yield (
                 f"{one.path} has {here}, {other.path} has {there}: no joint "
                 "is in both, are they of one robot?"
             )
-    return warnings
 
 
 def _joint_names(source: RawLog) -> set[str]:
@@ -348,9 +346,8 @@ def _joint_names(source: RawLog) -> set[str]:
     return found
 
 
-def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
+def _apart(sources: Sequence[RawLog], *, allowed: bool) -> Iterator[str]:
     """Warn of logs with time between them, and refuse those that are far apart."""
-    warnings: list[str] = []
     ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
     for k, later in enumerate(ordered[1:], start=1):
         earlier = max(ordered[:k], key=lambda each: each.end_ns)
@@ -359,8 +356,7 @@ def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
         if gap_s > LONGEST_MERGE_GAP_S and not allowed:
             raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
         if gap_s > _LATER_S:
-            warnings.append(sentence)
-    return warnings
+            yield sentence
 
 
 def _span(seconds: float) -> str:
@@ -370,21 +366,19 @@ def _span(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def _mixed(sources: Sequence[RawLog]) -> list[str]:
+def _mixed(sources: Sequence[RawLog]) -> Iterator[str]:
     """Warn of logs that hold the same topics at the same times."""
-    warnings: list[str] = []
     for one, other in combinations(sources, 2):
         start, stop = max(one.start_ns, other.start_ns), min(one.end_ns, other.end_ns)
         topics = {c.topic for c in one.file.channels.values() if one.file.counts.get(c.id)} & {
             c.topic for c in other.file.channels.values() if other.file.counts.get(c.id)
         }
         if start <= stop and topics:
-            warnings.append(
+            yield (
                 f"{one.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
                 f"{len(topics)} topics ({', '.join(sorted(topics)[:3])}"
                 f"{', ...' if len(topics) > 3 else ''}): their messages are mixed"
             )
-    return warnings
 
 
 def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMessage]]:

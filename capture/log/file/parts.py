@@ -131,11 +131,10 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
     return found
 
 
-def check_chain(parts: PartFiles) -> list[str]:
-    """Compare each part with its hash in the next one; return the faults, one sentence each."""
+def check_chain(parts: PartFiles) -> Iterator[str]:
+    """Compare each part with its hash in the next one; yield the faults, one sentence each."""
     from hashlib import file_digest
 
-    wrong: list[str] = []
     for number, file in parts.files.items():
         stated = _part_record(file).get("previous_sha256")
         former = parts.files.get(number - 1)
@@ -144,11 +143,10 @@ def check_chain(parts: PartFiles) -> list[str]:
         with former.path.open("rb") as stream:
             found = file_digest(stream, "sha256").hexdigest()
         if found != stated:
-            wrong.append(
+            yield (
                 f"{former.path.name} is not the file that {file.path.name} was recorded after: "
                 "its hash is another"
             )
-    return wrong
 
 
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
