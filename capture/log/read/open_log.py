@@ -172,10 +172,7 @@ class OpenLog:
         self, wanted: Mapping[str, Sequence[str] | None], found: dict[str, Messages]
     ) -> dict[str, pd.DataFrame]:
         """Return tables of some messages, which are removed from ``found`` one by one."""
-        read: dict[str, pd.DataFrame] = {}
-        for topic in wanted:
-            read[topic] = self._table(topic, found.pop(topic))
-        return read
+        return {topic: self._table(topic, found.pop(topic)) for topic in wanted}
 
     def _table(self, topic: str, found: Messages) -> pd.DataFrame:
         import pandas as pd  # a third of a second, which only tables need
@@ -195,9 +192,8 @@ def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """Return one layout group as a table."""
     import pandas as pd
 
-    columns: dict[str, Any] = {}
-    for path, text in group.strings.items():
-        columns[path] = np.full(len(group), text, dtype=object)
+    strings = group.strings.items()
+    columns: dict[str, Any] = {k: np.full(len(group), text, dtype=object) for k, text in strings}
     for path in group.paths:
         values = group.values(path)
         if group.layout.leaves[path].is_array:

@@ -326,14 +326,12 @@ def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]
 
 def _each_own(series: Series, offsets: Series) -> list[IntArray]:
     place = {name: j for j, name in enumerate(offsets.names)}
-    own: list[IntArray] = []
-    for name, t_ns in zip(series.names, series.t_ns, strict=True):
-        j = place.get(name)
-        if j is None or not len(offsets.t_ns[j]):
-            own.append(t_ns)
-            continue
-        own.append(moved(t_ns, offsets.t_ns[j], offsets.values[j]))
-    return own
+    return [
+        moved(t_ns, offsets.t_ns[j], offsets.values[j])
+        if (j := place.get(name)) is not None and len(offsets.t_ns[j])
+        else t_ns
+        for name, t_ns in zip(series.names, series.t_ns, strict=True)
+    ]
 
 
 def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
