@@ -181,19 +181,8 @@ def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
     return found
 
 
-BITRATES = {
-    10_000: b"S0",
-    20_000: b"S1",
-    50_000: b"S2",
-    100_000: b"S3",
-    125_000: b"S4",
-    250_000: b"S5",
-    500_000: b"S6",
-    750_000: b"S7",
-    800_000: b"S7",
-    1_000_000: b"S8",
-    83_300: b"S9",
-}
+_IN_ORDER = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+BITRATES = {rate: b"S%d" % k for k, rate in enumerate(_IN_ORDER)} | {750_000: b"S7", 83_300: b"S9"}
 """Bit rate [bit/s] to the command that sets it (S7 is 800,000 with some adapters)."""
 
 _CHUNK = 65536

@@ -27,7 +27,7 @@ from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import Contents, McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
 from .bag import BagCopy, is_bag
-from .content import content_id
+from .content import content_id, sha256_of
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -291,14 +291,7 @@ class LogFile(Contents):
         tags = [file.remote.tag for file in self.files if file.remote is not None]
         if tags:
             return f"etag {' '.join(tags)}"
-        from hashlib import sha256
-
-        digest = sha256()
-        for file in self.files:
-            with file.path.open("rb") as stream:
-                while piece := stream.read(1 << 20):
-                    digest.update(piece)
-        return digest.hexdigest()
+        return sha256_of(file.path for file in self.files)
 
     def source_of(self, block: Block) -> McapFile | WalTail:
         """Return the file, or the part of the write-ahead log, that holds a block."""

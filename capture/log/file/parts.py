@@ -18,6 +18,7 @@ from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
 from .bag_metadata import METADATA, is_rosbag2
+from .content import sha256_of
 
 PART_RECORD = "undulog.part"
 """Metadata record of a part: ``part`` (its number), ``previous`` and ``previous_sha256`` (file
@@ -133,16 +134,12 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
 
 def check_chain(parts: PartFiles) -> Iterator[str]:
     """Compare each part with its hash in the next one; yield the faults, one sentence each."""
-    from hashlib import file_digest
-
     for number, file in parts.files.items():
         stated = _part_record(file).get("previous_sha256")
         former = parts.files.get(number - 1)
         if stated is None or former is None:
             continue
-        with former.path.open("rb") as stream:
-            found = file_digest(stream, "sha256").hexdigest()
-        if found != stated:
+        if sha256_of([former.path]) != stated:
             yield (
                 f"{former.path.name} is not the file that {file.path.name} was recorded after: "
                 "its hash is another"

@@ -10,7 +10,7 @@ the stamps; how the motion continues over the gap is unknown.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -88,13 +88,11 @@ class JointSignals:
             DataError: If there is no such joint.
         """
         chosen = [self.signal(name) for name in names]
-        return JointSignals(
-            self.topic,
-            self.field,
-            self.unit,
-            tuple(signal.name for signal in chosen),
-            tuple(signal.t_ns for signal in chosen),
-            tuple(signal.values for signal in chosen),
+        return replace(
+            self,
+            names=tuple(signal.name for signal in chosen),
+            t_ns=tuple(signal.t_ns for signal in chosen),
+            values=tuple(signal.values for signal in chosen),
         )
 
     def frame(self) -> pd.DataFrame:
