@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
-from typing import cast
 
 from mcap.records import Schema
 
@@ -44,11 +43,10 @@ from .edited_log import (
     refuse_output,
 )
 from .messages.cdr import layout_of
-from .messages.definitions import JOINT_STATE, parse_message_type
+from .messages.definitions import JOINT_STATE, VERDICTS, parse_message_type, stated_reasons
 
 Record = tuple[str, dict[str, str]]
 
-_VERDICTS = ("good", "degraded", "bad")
 _SESSION_RECORD = "undulog"
 
 
@@ -140,7 +138,7 @@ def _merged_health(sources: Sequence[RawLog]) -> dict[str, str]:
     if len(stated) == len(sources) and all(other == facts[0] for other in facts):
         return facts[0]
     verdicts = [entry.get("verdict", "") for entry in facts]
-    worst = max(verdicts, key=lambda v: _VERDICTS.index(v) if v in _VERDICTS else len(_VERDICTS))
+    worst = max(verdicts, key=lambda v: VERDICTS.index(v) if v in VERDICTS else len(VERDICTS))
     reasons = [
         f"{source.path.name}: {reason}"
         for source in sources
@@ -152,13 +150,7 @@ def _merged_health(sources: Sequence[RawLog]) -> dict[str, str]:
 def _reasons(health: dict[str, str] | None) -> list[str]:
     if health is None:
         return ["states no verdict"]
-    text = health.get("reasons", "[]")
-    try:
-        reasons: object = json.loads(text)
-    except (ValueError, RecursionError):
-        reasons = [text]
-    listed = cast("list[object]", reasons) if isinstance(reasons, list) else [reasons]
-    return [health.get("verdict", "no verdict"), *map(str, listed)]
+    return [health.get("verdict", "no verdict"), *stated_reasons(health)]
 
 
 LONGEST_MERGE_GAP_S = 86400.0

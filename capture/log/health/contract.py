@@ -23,7 +23,13 @@ from ...common.remote import as_path
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
-from ..messages.definitions import CONTRACT_VERSION, JOINT_STATE, PowerTopic, is_of_contract
+from ..messages.definitions import (
+    CONTRACT_VERSION,
+    JOINT_STATE,
+    VERDICTS,
+    PowerTopic,
+    is_of_contract,
+)
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -35,7 +41,6 @@ from ..messages.frames import (
 )
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
-from .rules import VERDICTS
 
 RULES: Mapping[str, str] = MappingProxyType(
     {

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
+from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from ..read.facts import TIMES_FROM_FPS
 from ..read.joint_messages import JOINT_TYPES
@@ -62,7 +63,6 @@ BAD_JOINTS = 0.5
 
 _MOST_LISTED = 8
 
-VERDICTS = ("good", "degraded", "bad")
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 

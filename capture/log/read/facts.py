@@ -170,16 +170,12 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
                 record = ranges.get(index.offset, index.offset + index.length, _EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
-    if statistics is None or not statistics.message_count:
-        count = None if statistics is None else 0
-        return LogFacts(messages=count, topics=tuple(sorted(topics)), metadata=metadata)
-    return LogFacts(
-        start_ns=statistics.message_start_time,
-        end_ns=statistics.message_end_time,
-        messages=statistics.message_count,
-        topics=tuple(sorted(topics)),
-        metadata=metadata,
-    )
+    facts = LogFacts(topics=tuple(sorted(topics)), metadata=metadata)
+    if statistics is None:
+        return facts
+    count, start_ns = statistics.message_count, statistics.message_start_time
+    times = {"start_ns": start_ns, "end_ns": statistics.message_end_time} if count else {}
+    return replace(facts, messages=count, **times)
 
 
 def _records(data: bytes, start: int) -> Iterator[tuple[int, bytes]]:
