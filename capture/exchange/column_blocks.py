@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, cast
 
@@ -122,17 +123,9 @@ def arrow(what: str) -> Any:
         MissingExtraError: If it is not installed.
     """
     try:
-        from pyarrow import parquet
+        return import_module("pyarrow.parquet")
     except ImportError as error:
         raise MissingExtraError(what, "parquet", "pyarrow") from error
-    return parquet
-
-
-def _datasets() -> Any:
-    """Return pyarrow.dataset; its types are incomplete."""
-    from pyarrow import dataset
-
-    return dataset
 
 
 def read_parquet(
@@ -164,7 +157,7 @@ def read_parquet(
             if where is None:
                 yield from file.iter_batches(batch_size=rows, columns=columns)
                 return
-        dataset = _datasets()
+        dataset: Any = import_module("pyarrow.dataset")  # its types are incomplete
         yield from dataset.dataset(path, format="parquet").to_batches(
             columns=columns, filter=dataset.field(where[0]) == where[1],
             batch_size=rows, batch_readahead=1, fragment_readahead=1,

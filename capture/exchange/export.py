@@ -291,14 +291,8 @@ def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
 @contextmanager
 def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
     """Parquet: t_ns int64, topic and joint dictionaries of strings, the rest float64 or null."""
-    parquet = arrow("a .parquet table")
-    import pyarrow as pa
-
-    module: Any = pa  # its types are incomplete
-    text = module.dictionary(module.int32(), module.string())
-    fields: list[Any] = [("t_ns", module.int64()), ("topic", text), ("joint", text)]
-    schema = module.schema([*fields, *((name, module.float64()) for name in columns)])
-    with parquet.ParquetWriter(path, schema) as writer:
+    head = {"t_ns": "int64", "topic": "text", "joint": "text"}
+    with open_parquet(path, head, columns) as (module, write_arrays):
 
         def write(block: RowBlock) -> None:
             count = len(block.t_ns)
@@ -314,9 +308,40 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
                 else module.nulls(count, module.float64())
                 for name in columns
             ]
-            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+            write_arrays(arrays)
 
         yield write
+
+
+@contextmanager
+def open_parquet(
+    path: Path, head: Mapping[str, str], numbers: Sequence[str]
+) -> Generator[tuple[Any, Callable[[list[Any]], None]]]:
+    """Create a Parquet table.
+
+    Args:
+        head: First columns to their types: ``int64``, ``float64``, or ``text`` in a dictionary.
+        numbers: Columns of float64 after them.
+
+    Yields:
+        pyarrow, whose types are incomplete, and a function that writes arrays, one a column.
+
+    Raises:
+        MissingExtraError: If pyarrow is not installed.
+    """
+    parquet = arrow("a .parquet table")
+    import pyarrow as pa
+
+    module: Any = pa
+    kinds = {"int64": module.int64(), "float64": module.float64()}
+    kinds["text"] = module.dictionary(module.int32(), module.string())
+    columns = {**head, **dict.fromkeys(numbers, "float64")}
+    schema = module.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    with parquet.ParquetWriter(path, schema) as writer:
+        yield (
+            module,
+            lambda arrays: writer.write_table(module.Table.from_arrays(arrays, schema=schema)),
+        )
 
 
 TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}

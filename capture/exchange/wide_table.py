@@ -30,8 +30,7 @@ from ..common.strict_table import NAME_PATTERN
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import Quantity
-from .column_blocks import arrow
-from .export import ExportReport, chosen_format, joint_fields, joint_topics
+from .export import ExportReport, chosen_format, joint_fields, joint_topics, open_parquet
 
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block
@@ -293,13 +292,7 @@ def _open_csv(path: Path, names: Sequence[str], start_ns: int) -> Generator[Writ
 @contextmanager
 def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
     """Parquet: t_ns int64, the rest float64, null where a column has no sample."""
-    parquet = arrow("a .parquet table")
-    import pyarrow as pa
-
-    module: Any = pa  # its types are incomplete
-    fields: list[Any] = [("t_ns", module.int64()), ("time [s]", module.float64())]
-    schema = module.schema([*fields, *((name, module.float64()) for name in names)])
-    with parquet.ParquetWriter(path, schema) as writer:
+    with open_parquet(path, {"t_ns": "int64"}, ["time [s]", *names]) as (module, write_arrays):
 
         def write(block: WideBlock) -> None:
             count = len(block.t_ns)
@@ -314,7 +307,7 @@ def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[
                 cells[rows], missing[rows] = values, False
                 cells[missing] = 0.0
                 arrays.append(module.array(cells, mask=missing, from_pandas=False))
-            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+            write_arrays(arrays)
 
         yield write
 

@@ -129,7 +129,7 @@ class FreezeTally:
         """Indices in ``names`` of the joints of both, m of them."""
         self._measured = list(self.columns)
         self._commanded = [place[names[k]] for k in self.columns]
-        self._runs = _Runs(len(self.columns))
+        self._runs = _Runs(-(2**62), *np.zeros((3, len(self.columns)), np.int64))
 
     def result(
         self, measured: Ranges, command: Ranges, closed: int | None
@@ -165,22 +165,19 @@ class FreezeTally:
         return ahead.longest, ahead.longest_at
 
 
-class _Runs:
+class _Runs(NamedTuple):
     """Runs of flagged, consecutive seconds: the current and the longest one."""
 
-    def __init__(self, width: int) -> None:
-        self.second = -(2**62)
-        self.run = np.zeros(width, np.int64)
-        self.longest = np.zeros(width, np.int64)
-        self.longest_at = np.zeros(width, np.int64)
+    second: int
+    run: IntArray
+    longest: IntArray
+    longest_at: IntArray
 
     def after(self, seconds: IntArray, flags: BoolArray) -> _Runs:
         """Return the runs with more seconds, shape (s,), and flags, shape (s, m)."""
         if not len(seconds):
             return self
-        runs = _Runs(len(self.run))
-        before, run = self.second, self.run
-        longest, longest_at = self.longest.copy(), self.longest_at.copy()
+        before, run, longest, longest_at = self
         quiet = not run.any()
         some: list[bool] = np.asarray(flags.any(axis=1)).tolist()
         numbers: list[int] = seconds.tolist()
@@ -192,5 +189,4 @@ class _Runs:
                 longest_at = np.where(more, second + 1 - run, longest_at)
                 quiet = not some[k]
             before = second
-        runs.second, runs.run, runs.longest, runs.longest_at = before, run, longest, longest_at
-        return runs
+        return _Runs(before, run, longest, longest_at)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...common.arrays import NS, FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray, merged_ranges
 from ...common.errors import DataError
 from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
@@ -167,12 +167,7 @@ def longest_unbroken(
         for t_ns in {id(each): each for each in times_ns}.values()
         for run in _runs(cut(t_ns, (start_ns, stop_ns))[1])
     ]
-    joined: list[tuple[int, int]] = []
-    for first, last in sorted(runs):
-        if joined and first - joined[-1][1] <= BREAK_S * NS:
-            joined[-1] = joined[-1][0], max(joined[-1][1], last)
-        else:
-            joined.append((first, last))
+    joined = merged_ranges(sorted(runs), BREAK_S * NS)
     if not joined:
         return None
     longest = max(joined, key=lambda run: run[1] - run[0])
