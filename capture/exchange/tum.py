@@ -132,7 +132,8 @@ def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
         DataError: If it has no such frame; names those that it has.
     """
     kinds = {topic: channel.type_name for topic, channel in session.channels.items()}
-    posed = sorted((t for t, kind in kinds.items() if kind in _POSE_FIELD), key=_odometry_first)
+    posed = [topic for topic, kind in kinds.items() if kind in _POSE_FIELD]
+    posed.sort(key=lambda topic: (topic != "/odom", topic))
     moved = [topic for topic, kind in kinds.items() if kind == _TRANSFORMS]
     if not posed and not moved:
         raise MissingChannelError(session.path, "poses", sorted(kinds))
@@ -148,10 +149,6 @@ def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
         asked = "no Odometry, so name one (--frame)" if frame is None else f"no frame {frame!r}"
         raise DataError(f"{session.path}: has {asked}; it has {names}")
     return found
-
-
-def _odometry_first(topic: str) -> tuple[bool, str]:
-    return topic != "/odom", topic
 
 
 def _of_poses(session: Session, topic: str, kind: str) -> Iterator[Trajectory]:
