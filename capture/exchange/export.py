@@ -28,16 +28,9 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import MissingChannelError, UsageError
 from ..common.files import as_text, check_stop, csv_writer, number_cells, part_file
 from ..common.process import StopRequest
+from ..log.messages import frames as wire
 from ..log.messages.definitions import JOINT_STATE
-from ..log.messages.frames import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-)
+from ..log.messages.frames import FrameArray
 from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
@@ -47,17 +40,17 @@ from .frame_log import LogBlock, chosen_buses, frame_blocks, frame_facts, is_err
 
 _Format = TypeVar("_Format")
 
-_FLAGS = ERROR_FLAG | REMOTE_FLAG | EXTENDED_FLAG
+_FLAGS = wire.ERROR_FLAG | wire.REMOTE_FLAG | wire.EXTENDED_FLAG
 
 _FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
-    "identifier": lambda frames: frames["id_flags"] & ID_MASK,
+    "identifier": lambda frames: frames["id_flags"] & wire.ID_MASK,
     "flags": lambda frames: frames["id_flags"] & _FLAGS,
     "length code": lambda frames: frames["len"],
     "data": lambda frames: frames["data"],
     "direction": lambda frames: frames["dir"],
     "time below 1 us": lambda frames: frames["t_host_ns"],
-    "bit rate switch": lambda frames: frames["fd_flags"] & FD_BRS,
-    "error state": lambda frames: frames["fd_flags"] & FD_ESI,
+    "bit rate switch": lambda frames: frames["fd_flags"] & wire.FD_BRS,
+    "error state": lambda frames: frames["fd_flags"] & wire.FD_ESI,
 }
 """Field of a frame that a format may lose to its values, one row a frame."""
 

@@ -28,19 +28,10 @@ import numpy as np
 from mcap.writer import Writer
 
 from ..common.arrays import NS, BoolArray
+from ..log.messages import frames as wire
 from ..log.messages.cdr import encode, layout_of
 from ..log.messages.definitions import parse_message_type, schema_text
-from ..log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-)
+from ..log.messages.frames import FrameArray
 from .candump import candump_lines
 from .frame_log import FrameFacts, LogBlock, is_error, is_remote
 
@@ -87,7 +78,7 @@ def _open_ros(path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
 
         def write(block: LogBlock) -> None:
             messages = _interleaved(templates, block)
-            is_sent = (block.frames["dir"] == DIR_TX).tolist()
+            is_sent = (block.frames["dir"] == wire.DIR_TX).tolist()
             t_ns: list[int] = block.frames["t_host_ns"].tolist()
             buses: list[int] = block.bus.tolist()
             for bus, sent, t, data in zip(buses, is_sent, t_ns, messages, strict=True):
@@ -118,10 +109,10 @@ class _Template:
         columns = {
             "header.stamp.sec": t_ns // NS,
             "header.stamp.nanosec": t_ns % NS,
-            "id": id_flags & ID_MASK,
-            "is_rtr": (id_flags & REMOTE_FLAG) != 0,
-            "is_extended": (id_flags & EXTENDED_FLAG) != 0,
-            "is_error": (id_flags & ERROR_FLAG) != 0,
+            "id": id_flags & wire.ID_MASK,
+            "is_rtr": (id_flags & wire.REMOTE_FLAG) != 0,
+            "is_extended": (id_flags & wire.EXTENDED_FLAG) != 0,
+            "is_error": (id_flags & wire.ERROR_FLAG) != 0,
             "dlc": frames["len"],
             "data": frames["data"][:, :8],
         }
@@ -180,7 +171,7 @@ class FrameFormat:
 def _possible(block: LogBlock) -> FrameArray:
     """Copy frames, remote ones without data, CAN FD ones with 64 bytes and never remote."""
     frames, is_fd = block.frames.copy(), block.is_fd
-    frames["id_flags"][is_fd] &= ~np.uint32(REMOTE_FLAG)
+    frames["id_flags"][is_fd] &= ~np.uint32(wire.REMOTE_FLAG)
     frames["len"][is_fd] = np.minimum(frames["len"][is_fd], 64)
     frames["data"][is_remote(frames)] = 0
     return frames
@@ -194,7 +185,7 @@ def _shorten(frames: FrameArray, which: BoolArray) -> None:
 def _kept_by_candump(block: LogBlock) -> FrameArray:
     """Keep everything but data of remote frames and further flags of error frames."""
     frames = _possible(block)
-    frames["id_flags"][is_error(frames)] &= ID_MASK | ERROR_FLAG
+    frames["id_flags"][is_error(frames)] &= wire.ID_MASK | wire.ERROR_FLAG
     _shorten(frames, is_remote(frames))
     return frames
 
@@ -210,9 +201,9 @@ def _kept_by_blf(block: LogBlock) -> FrameArray:
     """Keep everything but data of remote frames, and directions and flags of error frames."""
     frames = _possible(block)
     error = is_error(frames)
-    frames["id_flags"][error] &= ID_MASK | ERROR_FLAG
+    frames["id_flags"][error] &= wire.ID_MASK | wire.ERROR_FLAG
     _shorten(frames, error & ~block.is_fd)
-    frames["dir"][error & ~block.is_fd] = DIR_RX
+    frames["dir"][error & ~block.is_fd] = wire.DIR_RX
     return frames
 
 
@@ -244,7 +235,7 @@ def _kept_by_asc(block: LogBlock) -> FrameArray:
     frames = _possible(block)
     frames["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
     empty = is_error(frames) & ~block.is_fd
-    frames["id_flags"][empty] = ERROR_FLAG
+    frames["id_flags"][empty] = wire.ERROR_FLAG
     for name in ("len", "data", "dir"):
         frames[name][empty] = 0
     # Readers take a length code above 8 for that of a CAN FD frame.
@@ -302,17 +293,17 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
         for row in block.rows():
             message = Message(
                 timestamp=(row.t_ns - start_s * NS + 0.5) / NS,  # python-can cuts to whole ns
-                arbitration_id=row.id_flags & ID_MASK,
-                is_extended_id=bool(row.id_flags & EXTENDED_FLAG),
-                is_remote_frame=bool(row.id_flags & REMOTE_FLAG),
-                is_error_frame=bool(row.id_flags & ERROR_FLAG),
+                arbitration_id=row.id_flags & wire.ID_MASK,
+                is_extended_id=bool(row.id_flags & wire.EXTENDED_FLAG),
+                is_remote_frame=bool(row.id_flags & wire.REMOTE_FLAG),
+                is_error_frame=bool(row.id_flags & wire.ERROR_FLAG),
                 channel=channels[row.bus],
                 dlc=row.length,
                 data=row.data,
-                is_rx=row.way != DIR_TX,
+                is_rx=row.way != wire.DIR_TX,
                 is_fd=row.is_fd,
-                bitrate_switch=bool(row.fd_flags & FD_BRS),
-                error_state_indicator=bool(row.fd_flags & FD_ESI),
+                bitrate_switch=bool(row.fd_flags & wire.FD_BRS),
+                error_state_indicator=bool(row.fd_flags & wire.FD_ESI),
             )
             writer(message)
 

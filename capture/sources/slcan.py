@@ -25,15 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from ..common.errors import SourceError, UsageError
-from ..log.messages.frames import (
-    EXTENDED_FLAG,
-    FD_BRS,
-    FRAME_DTYPE,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_fd_frames,
-)
+from ..log.messages import frames as wire
+from ..log.messages.frames import FrameArray, empty_fd_frames
 from ..robot.model import ClockDomain
 from .contract import (
     SourceAddress,
@@ -99,7 +92,7 @@ class SlcanText:
         tally.malformed("malformed line", len(found) - len(packed))
         if not self._has_fd:  # the usual case: nothing to pick
             return records(packed), empty_fd_frames(0)
-        size = FRAME_DTYPE.itemsize
+        size = wire.FRAME_DTYPE.itemsize
         fd = [record for record in packed if len(record) != size]
         return records(record for record in packed if len(record) == size), fd_records(fd)
 
@@ -110,13 +103,13 @@ class SlcanText:
         length = _FD_LENGTHS[int(digit, 16)]
         digits = 2 * length
         if kind in "TRxDB":
-            if flags > ID_MASK:
+            if flags > wire.ID_MASK:
                 return None
-            flags |= EXTENDED_FLAG
+            flags |= wire.EXTENDED_FLAG
         elif flags > _HIGHEST_STANDARD:
             return None
         if kind in "rR":
-            flags |= REMOTE_FLAG
+            flags |= wire.REMOTE_FLAG
             digits = 0
         if (len(rest) - digits) not in (0, 4):
             return None
@@ -128,7 +121,7 @@ class SlcanText:
         data = bytes.fromhex(rest[:digits])
         if kind in "dDbB":
             self._has_fd = True
-            brs = FD_BRS if kind in "bB" else 0
+            brs = wire.FD_BRS if kind in "bB" else 0
             return pack_fd_record(device_ns, t_ns, flags, length, 0, brs, data)
         return pack_record(device_ns, t_ns, flags, length, 0, data)
 

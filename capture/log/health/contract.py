@@ -23,21 +23,13 @@ from ...common.remote import as_path
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
+from ..messages import frames as wire
 from ..messages.definitions import (
     CONTRACT_VERSION,
     JOINT_STATE,
     VERDICTS,
     PowerTopic,
     is_of_contract,
-)
-from ..messages.frames import (
-    FD_FRAME_DTYPE,
-    FD_FRAME_LAYOUT,
-    FRAME_DTYPE,
-    FRAME_LAYOUT,
-    FRAME_TOPIC_PREFIXES,
-    FRAMES_TYPE,
-    SERIAL_TOPIC_PREFIX,
 )
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
@@ -64,7 +56,7 @@ RULES: Mapping[str, str] = MappingProxyType(
 )
 """Name of each rule to what it asks for."""
 
-_FRAME_PREFIXES = (*FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX)
+_FRAME_PREFIXES = (*wire.FRAME_TOPIC_PREFIXES, wire.SERIAL_TOPIC_PREFIX)
 _UNITS = {
     "/joint_commands": "rad",
     "/joint_states": "rad",
@@ -94,7 +86,7 @@ _TYPES = dict.fromkeys([*_UNITS, "/gait"], JOINT_STATE) | {
 _TYPES_BELOW = {
     "/ir/": "sensor_msgs/msg/Range",
     "/clock/": "sensor_msgs/msg/TimeReference",
-    **dict.fromkeys(_FRAME_PREFIXES, FRAMES_TYPE),
+    **dict.fromkeys(_FRAME_PREFIXES, wire.FRAMES_TYPE),
 }
 _OTHER_NAMES = {"/gait", "/energy_ledger"}
 """JointStates whose names are no joints."""
@@ -296,7 +288,9 @@ def _names(view: SessionView, topic: str) -> Iterator[Violation]:
 
 def _frames(topic: str, message: Any) -> Iterator[Violation]:
     fd = not topic.startswith("/can/")
-    layout, dtype = (FD_FRAME_LAYOUT, FD_FRAME_DTYPE) if fd else (FRAME_LAYOUT, FRAME_DTYPE)
+    layout, dtype = (
+        (wire.FD_FRAME_LAYOUT, wire.FD_FRAME_DTYPE) if fd else (wire.FRAME_LAYOUT, wire.FRAME_DTYPE)
+    )
     size = dtype.itemsize
     dims = [(one.label, one.size) for one in message.layout.dim]
     count = len(message.data) // size
