@@ -123,10 +123,10 @@ def arrow(what: str) -> Any:
         MissingExtraError: If it is not installed.
     """
     try:
-        import_module("pyarrow")  # also where its submodule was imported before
-        return import_module("pyarrow.parquet")
+        from pyarrow import parquet
     except ImportError as error:
         raise MissingExtraError(what, "parquet", "pyarrow") from error
+    return parquet
 
 
 def read_parquet(
