@@ -82,7 +82,7 @@ def import_log(
     if map_ and log.is_dir():
         raise UsageError(f"{log} is a folder; --map is for one table")
     from ..common.process import interruptible
-    from ..exchange.bag_import import is_recording
+    from ..exchange.bag_import import import_bag, is_recording
     from ..exchange.can_import import import_can
     from ..exchange.lerobot_import import import_lerobot, is_lerobot
     from ..exchange.table_guess import parse_units
@@ -103,9 +103,7 @@ def import_log(
         given |= {"--command-topic": topics.command_topic, "--response-topic": topics}
     kind = _LEROBOT if dataset else _BAG if bag else _TABLE if table else _FRAMES
     _check_options(log, kind, [name for name, value in given.items() if value not in (None, ())])
-    if bag:
-        return _import_bag(log, output, robot, topics, force=force, json=json)
-    described = load_robot(robot) if robot is not None else None
+    described = None if bag or robot is None else load_robot(robot)
     units = parse_units(unit)
     column_map = _column_map(described, columns, map_)
     with interruptible() as stop:
@@ -113,6 +111,9 @@ def import_log(
             reports = import_lerobot(
                 log, output, episode=episode, robot=described, units=units, force=force, stop=stop
             )
+        elif bag:
+            names = topics.names
+            reports = [import_bag(log, output, robot=robot, topics=names, force=force, stop=stop)]
         elif not table:
             if described is None:
                 raise UsageError(f"{log} holds CAN frames: --robot says what they mean")
@@ -129,23 +130,6 @@ def import_log(
             )  # fmt: skip
             reports = [report]
     return _report_imports(reports, json=json)
-
-
-def _import_bag(
-    log: Path,
-    output: Path,
-    robot: str | None,
-    topics: JointTopicOptions,
-    *,
-    force: bool,
-    json: bool,
-) -> int:
-    from ..common.process import interruptible
-    from ..exchange.bag_import import import_bag
-
-    with interruptible() as stop:
-        report = import_bag(log, output, robot=robot, topics=topics.names, force=force, stop=stop)
-    return _report_imports([report], json=json)
 
 
 def _report_imports(reports: Sequence[ImportReport], *, json: bool) -> int:

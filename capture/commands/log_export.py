@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,8 +15,7 @@ from ..common.errors import UsageError
 from .sessions import sessions_of
 
 if TYPE_CHECKING:
-    from ..common.process import StopRequest
-    from ..exchange.plot_layouts import LayoutReport
+    from ..exchange.export import ExportReport
 
 Target = Literal["wide", "lerobot", "rosbag2", "tum", "foxglove-layout", "plotjuggler-layout"]
 
@@ -75,14 +75,15 @@ def log_export(
 
     if not sessions:
         raise UsageError("log export needs a session, e.g. undulog log export run.mcap -o run.csv")
-    options = _Options(bus, topics, fps, task, frame)
+    options = {"bus": bus, "topics": topics, "fps": fps, "task": task, "frame": frame}
+    given = {key: value for key, value in options.items() if value not in (None, ())}
     name, target = _target(to, output)
-    target.check(name, sessions, options)
-    if target.several:
-        sessions = tuple(sessions_of(sessions))
+    target.check(name, sessions, given)
+    read: Any = tuple(sessions_of(sessions)) if target.several else sessions[0]
+    export = getattr(import_module(f"undulog.capture.exchange.{target.module}"), target.function)
     with interruptible() as stop:
-        written = target.write(_Request(sessions, output, options, force, stop))
-    source: Any = [str(path) for path in sessions] if target.several else str(sessions[0])
+        written: ExportReport = export(read, output, **given, force=force, stop=stop)
+    source: Any = [str(path) for path in read] if target.several else str(read)
     facts = {"source": source, "output": str(output), **written.facts}
     facts["warnings"] = written.warnings
     lines = [f"{output}: {written.what}", *(f"  warning: {each}" for each in written.warnings)]
@@ -90,65 +91,36 @@ def log_export(
 
 
 @dataclass(frozen=True)
-class _Options:
-    """The options that some formats have, as given; the default of each is that of its format."""
-
-    bus: str | None = None
-    topics: tuple[str, ...] = ()
-    fps: int | None = None
-    task: str | None = None
-    frame: str | None = None
-
-
-@dataclass(frozen=True)
-class _Request:
-    sessions: tuple[Path, ...]
-    output: Path
-    options: _Options
-    force: bool
-    stop: StopRequest
-
-    @property
-    def common(self) -> dict[str, Any]:
-        """Arguments of every export."""
-        return {"force": self.force, "stop": self.stop}
-
-
-@dataclass(frozen=True)
-class _Written:
-    """What was written: facts for JSON, a phrase for people, and warnings."""
-
-    facts: dict[str, Any]
-    what: str
-    warnings: list[str]
-
-
-@dataclass(frozen=True)
 class _Target:
     """A kind of output.
 
     Attributes:
+        module: That of the exchange that writes it.
+        function: Its function that does, which has the options as arguments.
         holds: What it has, for the refusal of options of other kinds.
         takes: The options that it has.
         several: Whether it takes several sessions.
     """
 
-    write: Callable[[_Request], _Written]
+    module: str
+    function: str
     holds: str
-    takes: frozenset[str] = field(default_factory=frozenset[str])
+    takes: tuple[str, ...] = ()
     several: bool = False
 
-    def check(self, name: str, sessions: tuple[Path, ...], options: _Options) -> None:
+    def check(self, name: str, sessions: tuple[Path, ...], given: Mapping[str, object]) -> None:
         """Refuse options and sessions that it doesn't take.
 
         Raises:
             UsageError: If there are some.
         """
-        for each in fields(options):
-            if getattr(options, each.name) != each.default and each.name not in self.takes:
-                raise UsageError(f"--{each.name} is for {_FOR[each.name]}; {name} {self.holds}")
+        for option in given:
+            if option not in self.takes:
+                raise UsageError(f"--{option} is for {_FOR[option]}; {name} {self.holds}")
         if len(sessions) > 1 and not self.several:
             raise UsageError(f"{name} takes one session, not {len(sessions)}")
+        if "fps" in self.takes and "fps" not in given:
+            raise UsageError(f"{name} needs --fps, the frames a second of the dataset")
 
 
 def _target(to: str | None, output: Path) -> tuple[str, _Target]:
@@ -170,88 +142,6 @@ def _target(to: str | None, output: Path) -> tuple[str, _Target]:
     )
 
 
-def _frames(request: _Request) -> _Written:
-    from ..exchange.export import export_log
-
-    (session,), options = request.sessions, request.options
-    trace = export_log(session, request.output, bus=options.bus, **request.common)
-    count = sum(trace.buses.values())
-    what = f"{count} frames of {', '.join(trace.buses)}, in the format of {trace.title}"
-    return _Written({"frames": count, "buses": trace.buses}, what, trace.warnings)
-
-
-def _table(request: _Request) -> _Written:
-    from ..exchange.export import export_columns
-
-    (session,), options = request.sessions, request.options
-    table = export_columns(session, request.output, topics=options.topics, **request.common)
-    count = sum(table.rows.values())
-    what = f"{count} rows of {', '.join(table.rows)}"
-    return _Written({"rows": count, "topics": table.rows}, what, table.warnings)
-
-
-def _wide(request: _Request) -> _Written:
-    from ..exchange.wide_table import export_wide
-
-    (session,), options = request.sessions, request.options
-    table = export_wide(session, request.output, topics=options.topics, **request.common)
-    what = f"{table.rows} rows of {len(table.columns)} columns"
-    return _Written({"rows": table.rows, "columns": table.columns}, what, table.warnings)
-
-
-def _lerobot(request: _Request) -> _Written:
-    from ..exchange.lerobot_export import export_lerobot
-
-    options = request.options
-    if options.fps is None:
-        raise UsageError("--to lerobot needs --fps, the frames a second of the dataset")
-    report = export_lerobot(
-        request.sessions, request.output, fps=options.fps, task=options.task, **request.common
-    )
-    count = len(report.episodes)
-    what = f"{sum(report.episodes)} frames in {count} episode{'' if count == 1 else 's'}"
-    return _Written({"episodes": report.episodes, "fps": options.fps}, what, report.warnings)
-
-
-def _rosbag2(request: _Request) -> _Written:
-    from ..exchange.rosbag2_export import export_rosbag2
-
-    (session,) = request.sessions
-    report = export_rosbag2(session, request.output, **request.common)
-    count = sum(report.messages.values())
-    what = f"{count} messages of {len(report.messages)} topics"
-    return _Written({"messages": report.messages}, what, report.warnings)
-
-
-def _tum(request: _Request) -> _Written:
-    from ..exchange.tum import export_tum
-
-    (session,), options = request.sessions, request.options
-    report = export_tum(session, request.output, frame=options.frame, **request.common)
-    what = f"{report.poses} poses of {report.frame} in {report.parent}, from {report.topic}"
-    facts = {"poses": report.poses, "frame": report.frame, "parent": report.parent}
-    return _Written(facts | {"topic": report.topic}, what, report.warnings)
-
-
-def _layout(request: _Request, export: Callable[..., LayoutReport]) -> _Written:
-    (session,), options = request.sessions, request.options
-    report = export(session, request.output, topics=options.topics, force=request.force)
-    what = f"plots of {len(report.joints)} joints"
-    return _Written({"joints": report.joints}, what, report.warnings)
-
-
-def _foxglove(request: _Request) -> _Written:
-    from ..exchange.plot_layouts import export_foxglove_layout
-
-    return _layout(request, export_foxglove_layout)
-
-
-def _plotjuggler(request: _Request) -> _Written:
-    from ..exchange.plot_layouts import export_plotjuggler_layout
-
-    return _layout(request, export_plotjuggler_layout)
-
-
 _FOR = {
     "bus": "CAN frames",
     "topics": "tables and layouts",
@@ -261,14 +151,17 @@ _FOR = {
 }
 """Option to the outputs that have it."""
 
-_FRAMES = _Target(_frames, "has CAN frames", frozenset({"bus"}))
-_TABLE = _Target(_table, "has joint columns", frozenset({"topics"}))
+_FRAMES = _Target("export", "export_log", "has CAN frames", ("bus",))
+_TABLE = _Target("export", "export_columns", "has joint columns", ("topics",))
 _TARGETS = {
-    "wide": _Target(_wide, "has joint columns", frozenset({"topics"})),
-    "lerobot": _Target(_lerobot, "has episodes", frozenset({"fps", "task"}), several=True),
-    "rosbag2": _Target(_rosbag2, "has all messages"),
-    "tum": _Target(_tum, "has poses", frozenset({"frame"})),
-    "foxglove-layout": _Target(_foxglove, "has plots", frozenset({"topics"})),
-    "plotjuggler-layout": _Target(_plotjuggler, "has plots", frozenset({"topics"})),
+    "wide": _Target("wide_table", "export_wide", "has joint columns", ("topics",)),
+    "lerobot": _Target(
+        "lerobot_export", "export_lerobot", "has episodes", ("fps", "task"), several=True
+    ),
+    "rosbag2": _Target("rosbag2_export", "export_rosbag2", "has all messages"),
+    "tum": _Target("tum", "export_tum", "has poses", ("frame",)),
+    **{
+        f"{name}-layout": _Target("plot_layouts", f"export_{name}_layout", "has plots", ("topics",))
+        for name in ("foxglove", "plotjuggler")
+    },
 }
-"""Value of ``--to`` to the kind of output."""

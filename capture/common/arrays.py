@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -12,6 +13,7 @@ IntArray: TypeAlias = NDArray[np.int64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
+_Number = TypeVar("_Number", int, float)
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
 
@@ -23,3 +25,16 @@ def frozen(array: _Array) -> _Array:
     """Mark an array read-only, in place, and return it."""
     array.setflags(write=False)
     return array
+
+
+def merged_ranges(
+    ranges: Iterable[tuple[_Number, _Number]], gap: float
+) -> list[tuple[_Number, _Number]]:
+    """Join ranges, in order of their starts, that are no further apart than a gap."""
+    found: list[tuple[_Number, _Number]] = []
+    for start, stop in ranges:
+        if found and start - found[-1][1] <= gap:
+            found[-1] = found[-1][0], max(found[-1][1], stop)
+        else:
+            found.append((start, stop))
+    return found

@@ -30,7 +30,8 @@ command line: 1 the work failed, 2 wrong usage.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -234,3 +235,22 @@ class ImportFormatError(LogError, ValueError):
 
 class LogWriteError(LogError, OSError):
     """The log could not be written: disk full, closed, no permission."""
+
+
+@contextmanager
+def raised_as(
+    kind: type[_PathError], path: Path | str, what: str, *caught: type[Exception]
+) -> Generator[None]:
+    """Raise errors of a library as one that names the file; those of this tree pass.
+
+    Args:
+        kind: The error to raise.
+        what: What failed, before the library's text.
+        caught: The library's errors.
+    """
+    try:
+        yield
+    except UndulogError:
+        raise
+    except caught as error:
+        raise kind(path, f"{what}: {error}" if what else str(error)) from error

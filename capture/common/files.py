@@ -15,7 +15,7 @@ from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from .console import refuse_existing
 from .errors import (
@@ -117,6 +117,22 @@ class Shelf:
         from importlib import resources
 
         return resources.files(self.package) / self.folder
+
+
+class Closing:
+    """What is closed when its ``with`` block is left, also by an exception."""
+
+    def __enter__(self) -> Self:
+        """Return the object itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Release what it holds."""
+        raise NotImplementedError
 
 
 def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool) -> None:

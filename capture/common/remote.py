@@ -10,15 +10,15 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path, PosixPath
 from typing import Any
 from urllib.parse import unquote
 
-from .errors import InputFileError, LogWriteError, MissingExtraError
+from .errors import InputFileError, LogWriteError, MissingExtraError, raised_as
 
 HEAD_SIZE = 64 << 10
 """Bytes that are fetched when a file is opened."""
@@ -233,7 +233,7 @@ class ObjectStore:
         self._parquet: Any = pq
         self.where = where
         self.is_local = "://" not in where
-        with _errors(InputFileError, where, (OSError, ValueError)):
+        with raised_as(InputFileError, where, "", OSError, ValueError):
             if self.is_local:
                 self.filesystem: Any = self._fs_module.LocalFileSystem()
                 self.base = Path(where).resolve().as_posix()
@@ -250,7 +250,7 @@ class ObjectStore:
         Raises:
             InputFileError: If one can't be made.
         """
-        with _errors(InputFileError, self.where):
+        with raised_as(InputFileError, self.where, "", OSError):
             for name in names:
                 self.filesystem.create_dir(self.path(name), recursive=True)
 
@@ -269,7 +269,7 @@ class ObjectStore:
         selector = self._fs_module.FileSelector(
             self.path(folder), allow_not_found=True, recursive=recursive
         )
-        with _errors(InputFileError, self.where):
+        with raised_as(InputFileError, self.where, "", OSError):
             found = self.filesystem.get_file_info(selector)
         start = len(self.base) + 1
         files = [
@@ -286,7 +286,7 @@ class ObjectStore:
             InputFileError: If it can't be read.
         """
         with (
-            _errors(InputFileError, f"{self.where}/{name}"),
+            raised_as(InputFileError, f"{self.where}/{name}", "", OSError),
             self.filesystem.open_input_stream(self.path(name)) as stream,
         ):
             return stream.read()
@@ -304,7 +304,7 @@ class ObjectStore:
             InputFileError: If it can't be read.
         """
         path, files = self.path(name), self.filesystem
-        with _errors(InputFileError, f"{self.where}/{name}", (OSError, ValueError)):
+        with raised_as(InputFileError, f"{self.where}/{name}", "", OSError, ValueError):
             return self._parquet.read_table(path, columns=columns, filesystem=files)
 
     def write(self, name: str, data: bytes) -> None:
@@ -314,7 +314,7 @@ class ObjectStore:
             LogWriteError: If it can't be written.
         """
         path = self.path(name)
-        with _errors(LogWriteError, f"{self.where}/{name}"):
+        with raised_as(LogWriteError, f"{self.where}/{name}", "", OSError):
             if self.is_local:
                 part = Path(f"{path}.{os.getpid()}-{os.urandom(4).hex()}.part")
                 try:
@@ -345,18 +345,8 @@ class ObjectStore:
         Raises:
             LogWriteError: If it can't be removed.
         """
-        with _errors(LogWriteError, f"{self.where}/{name}"), suppress(FileNotFoundError):
+        with (
+            raised_as(LogWriteError, f"{self.where}/{name}", "", OSError),
+            suppress(FileNotFoundError),
+        ):
             self.filesystem.delete_file(self.path(name))
-
-
-@contextmanager
-def _errors(
-    kind: type[InputFileError | LogWriteError],
-    where: str,
-    caught: tuple[type[Exception], ...] = (OSError,),
-) -> Generator[None]:
-    """Turn errors of a file system into one that names the file."""
-    try:
-        yield
-    except caught as error:
-        raise kind(where, str(error)) from error

@@ -256,15 +256,11 @@ class Table:
 
         A default need not be within the bounds.
         """
-        value = self.look(key)[1]
-        if value is None and default is not None:
-            return default
-        number = finite_number(value)
-        if number is not None and all(bound.holds(number) for bound in (*bounds, _USUAL)):
-            return number
-        words = _limits(bounds, [] if number is None else [number])
-        self.fault(key, f"a finite number {' and '.join(words)}".strip())
-        return math.nan
+        number = finite_number(self.look(key)[1])
+        good = number is not None and all(bound.holds(number) for bound in (*bounds, _USUAL))
+        limits = " and ".join(_limits(bounds, [] if number is None else [number]))
+        valid = f"a finite number {limits}".strip()
+        return self._value(key, default, lambda _: number if good else None, valid, math.nan)
 
     def integer(self, key: str, least: int, default: int | None = None) -> int:
         """Return a whole number from ``least`` on; ``least`` after a fault."""

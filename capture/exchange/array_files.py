@@ -23,7 +23,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError
+from ..common.errors import ImportFormatError, raised_as
 from .column_blocks import MOST_BYTES, UNZIPPING, check_cells, read_entry, refuse
 
 _MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
@@ -75,24 +75,22 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ImportFormatError: If it is no such zip, or its pickle does more than name tensors.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
-            root = pickle.removesuffix("data.pkl")
-            if archive.getinfo(pickle).file_size > _MOST_PICKLE:
-                refuse(path, "its data.pkl is too large to name tensors only")
-            value = _Machine(path).run(bytes(read_entry(archive, archive.getinfo(pickle))))
-            storages = _Storages(path, archive, root)
-            return {
-                name: storages.array(tensor) if tensor is not None else np.array(None)
-                for name, tensor in _named(value).items()
-            }
-    except ImportFormatError:
-        raise
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
-        raise ImportFormatError(path, f"is no file of tensors by torch.save: {error}") from error
-    except (*UNZIPPING, RecursionError) as error:
-        raise ImportFormatError(path, f"is no zip by torch.save: {error}") from error
+    faults = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
+    with (
+        raised_as(ImportFormatError, path, "is no zip by torch.save", *UNZIPPING),
+        raised_as(ImportFormatError, path, "is no file of tensors by torch.save", *faults),
+        zipfile.ZipFile(path) as archive,
+    ):
+        (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
+        root = pickle.removesuffix("data.pkl")
+        if archive.getinfo(pickle).file_size > _MOST_PICKLE:
+            refuse(path, "its data.pkl is too large to name tensors only")
+        value = _Machine(path).run(bytes(read_entry(archive, archive.getinfo(pickle))))
+        storages = _Storages(path, archive, root)
+        return {
+            name: storages.array(tensor) if tensor is not None else np.array(None)
+            for name, tensor in _named(value).items()
+        }
 
 
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
@@ -265,21 +263,20 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ImportFormatError: If it is damaged or expands too far.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_BYTES:
-                refuse(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
-            check_cells(path, size // 8)
-            return {
-                info.filename.removesuffix(".npy"): array
-                for info in archive.infolist()
-                if (array := _npy(read_entry(archive, info), info.filename)) is not None
-            }
-    except ImportFormatError:
-        raise
-    except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
-        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
+    caught = (OSError, ValueError, RuntimeError, *UNZIPPING)
+    with (
+        raised_as(ImportFormatError, path, "can't be read as .npz", *caught),
+        zipfile.ZipFile(path) as archive,
+    ):
+        size = sum(info.file_size for info in archive.infolist())
+        if size > MOST_BYTES:
+            refuse(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
+        check_cells(path, size // 8)
+        return {
+            info.filename.removesuffix(".npy"): array
+            for info in archive.infolist()
+            if (array := _npy(read_entry(archive, info), info.filename)) is not None
+        }
 
 
 def _npy(data: bytearray, name: str) -> NDArray[Any] | None:
@@ -308,7 +305,8 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
     """
     from scipy.io import loadmat, whosmat
 
-    try:
+    # scipy raises whatever a damaged file leads to
+    with raised_as(ImportFormatError, path, "can't be read as .mat", Exception):
         with path.open("rb") as stream:
             start = stream.read(128)
         if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
@@ -322,11 +320,7 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
         numeric = ("double", "single", "logical", "int", "uint")
         names = [name for name, _, kind in listed if kind.startswith(numeric)]
         found = loadmat(path, variable_names=names) if names else {}
-    except ImportFormatError:
-        raise
-    except Exception as error:  # scipy raises whatever a damaged file leads to
-        raise ImportFormatError(path, f"can't be read as .mat: {error}") from error
-    return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
+        return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
 
 
 def _check_mat(path: Path) -> None:

@@ -35,18 +35,9 @@ from can.io.blf import (
     BLFParseError,
 )
 
-from ..common.errors import ImportFormatError
+from ..common.errors import ImportFormatError, raised_as
 from ..common.files import is_file
-from ..log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-)
+from ..log.messages import frames as wire
 from .candump import read_candump
 from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of
 from .mf4 import open_mf4
@@ -228,14 +219,12 @@ def log_suffix(path: Path) -> str:
 def _reader(path: Path) -> MessageReader:
     from can import LogReader
 
-    try:
+    with raised_as(ImportFormatError, path, "can't be read", *_READ_ERRORS):
         if log_suffix(path) == ".blf":
             return CheckedBLFReader(path)
         if log_suffix(path) == ".db":
             _check_database(path)
         return LogReader(path)
-    except _READ_ERRORS as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
 def _check_database(path: Path) -> None:
@@ -271,10 +260,8 @@ def _python_can_log(
 
 def _lines(path: Path, stream: TextIO) -> Iterator[str]:
     """Yield the lines of a text; errors name the file."""
-    try:
+    with raised_as(ImportFormatError, path, "can't be read", OSError, EOFError):  # a damaged .gz
         yield from stream
-    except (OSError, EOFError) as error:  # a damaged .gz, above all
-        raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
 def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
@@ -333,7 +320,7 @@ def _is_frame(message: Message) -> bool:
         isinstance(time, int | float)
         and -_LATEST_S < time < _LATEST_S
         and isinstance(identifier, int)
-        and 0 <= identifier <= ID_MASK
+        and 0 <= identifier <= wire.ID_MASK
         and isinstance(code, int)
         and 0 <= code <= _MOST_BYTES
         and isinstance(record.data, bytes | bytearray | memoryview)
@@ -349,19 +336,19 @@ def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow
     is_fd = (message.is_fd or len(message.data) > 8) and not message.is_error_frame
     data = bytes(message.data[: 64 if is_fd else 8])
     flags = (
-        (ERROR_FLAG if message.is_error_frame else 0)
+        (wire.ERROR_FLAG if message.is_error_frame else 0)
         # None in CAN FD: python-can takes empty frames for such.
-        | (REMOTE_FLAG if message.is_remote_frame and not is_fd else 0)
-        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
+        | (wire.REMOTE_FLAG if message.is_remote_frame and not is_fd else 0)
+        | (wire.EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
     )
-    fd_flags = (FD_BRS if message.bitrate_switch else 0) | (
-        FD_ESI if message.error_state_indicator else 0
+    fd_flags = (wire.FD_BRS if message.bitrate_switch else 0) | (
+        wire.FD_ESI if message.error_state_indicator else 0
     )
     return FrameRow(
         t_ns=t_ns,
         id_flags=message.arbitration_id | flags,
         length=len(data) if is_fd else message.dlc,
-        way=DIR_RX if message.is_rx else DIR_TX,
+        way=wire.DIR_RX if message.is_rx else wire.DIR_TX,
         bus=log.bus_index(f"can{channel}" if isinstance(channel, int) else str(channel or "can0")),
         is_fd=is_fd,
         fd_flags=fd_flags if is_fd else 0,

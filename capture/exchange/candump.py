@@ -23,15 +23,8 @@ from pathlib import Path
 from ..common.arrays import NS
 from ..common.errors import ImportFormatError
 from ..log.mcap.chunk import LAST_NS
-from ..log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    ID_MASK,
-    REMOTE_FLAG,
-    identifier_text,
-)
+from ..log.messages import frames as wire
+from ..log.messages.frames import identifier_text
 from .frame_log import FrameLog, FrameRow, LogBlock, blocks_of
 
 _LINE = re.compile(
@@ -91,18 +84,18 @@ def _row(match: re.Match[str], log: FrameLog) -> FrameRow:
     flags = 0
     if len(digits) == 8:
         # candump prints the error flag within the digits, and nothing else above 29 bits.
-        flags = ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
+        flags = wire.ERROR_FLAG if identifier & wire.ERROR_FLAG else wire.EXTENDED_FLAG
     content = bytes.fromhex(data or fd_data or "")
     length = int(raw_dlc, 16) if raw_dlc else len(content)
     if remote_dlc is not None:
         length = int(remote_dlc or 0)
-        flags |= REMOTE_FLAG
+        flags |= wire.REMOTE_FLAG
     return FrameRow(
         # No block holds a later time; nor does a stamp, so such frames are left out anyway.
         min(int(seconds) * NS + int(fraction.ljust(9, "0")), LAST_NS),
-        (identifier & ID_MASK) | flags,
+        (identifier & wire.ID_MASK) | flags,
         length,
-        DIR_TX if way in {"T", "t"} else DIR_RX,
+        wire.DIR_TX if way in {"T", "t"} else wire.DIR_RX,
         log.bus_index(bus),
         fd_flags is not None,
         int(fd_flags, 16) if fd_flags else 0,
@@ -126,18 +119,18 @@ def candump_lines(
         payload = data.hex().upper()
         if is_fd:
             payload = f"#{fd_flags & 0xF:X}{payload}"
-        elif id_flags & REMOTE_FLAG:
+        elif id_flags & wire.REMOTE_FLAG:
             payload = f"R{length or ''}"
         elif length > 8:
             payload += f"_{length:X}"
-        tail = (" T" if way == DIR_TX else " R") if directions else ""
+        tail = (" T" if way == wire.DIR_TX else " R") if directions else ""
         time = f"({seconds}.{rest // unit:0{digits}d})"
         yield f"{time} {buses[bus]} {_identifier(id_flags)}#{payload}{tail}\n"
 
 
 def _identifier(id_flags: int) -> str:
-    if id_flags & ERROR_FLAG:
-        return f"{id_flags & (ID_MASK | ERROR_FLAG):08X}"
+    if id_flags & wire.ERROR_FLAG:
+        return f"{id_flags & (wire.ID_MASK | wire.ERROR_FLAG):08X}"
     return identifier_text(id_flags)
 
 

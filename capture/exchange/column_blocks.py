@@ -9,13 +9,14 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError, LogError, MissingExtraError
+from ..common.errors import ImportFormatError, MissingExtraError, raised_as
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
@@ -128,13 +129,6 @@ def arrow(what: str) -> Any:
     return parquet
 
 
-def _datasets() -> Any:
-    """Return pyarrow.dataset; its types are incomplete."""
-    from pyarrow import dataset
-
-    return dataset
-
-
 def read_parquet(
     path: Path, columns: Sequence[str] | None, rows: int, where: tuple[str, int] | None = None
 ) -> Iterator[Any]:
@@ -153,7 +147,8 @@ def read_parquet(
         MissingExtraError: If pyarrow is not installed.
     """
     parquet = arrow("a .parquet table")
-    try:
+    # pyarrow has errors of many bases
+    with raised_as(ImportFormatError, path, "can't be read as Parquet", Exception):
         with parquet.ParquetFile(path) as file:
             names = Counter(cast("list[str]", file.schema_arrow.names))
             for name in names if columns is None else columns:
@@ -163,15 +158,11 @@ def read_parquet(
             if where is None:
                 yield from file.iter_batches(batch_size=rows, columns=columns)
                 return
-        dataset = _datasets()
+        dataset: Any = import_module("pyarrow.dataset")  # its types are incomplete
         yield from dataset.dataset(path, format="parquet").to_batches(
             columns=columns, filter=dataset.field(where[0]) == where[1],
             batch_size=rows, batch_readahead=1, fragment_readahead=1,
         )  # fmt: skip
-    except LogError:
-        raise
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
 
 
 def block_of(batch: Any) -> Block:

@@ -189,25 +189,23 @@ def _parse(values: dict[str, Any], robot: Robot | None) -> tuple[ColumnMap, tupl
     delimiter = top.text("delimiter", ",")
     if delimiter not in _DELIMITERS:
         top.fault("delimiter", " ".join(json.dumps(each) for each in _DELIMITERS))
-    time = top.table("time")
-    time_column, time_unit = time.text("column"), time.text("unit")
-    if time_unit not in TIME_UNITS:
-        time.fault("unit", listed(TIME_UNITS, time_unit))
-    time.close()
-    commands_time = None
-    if "commands_time" in top:
-        own = top.table("commands_time")
-        commands_time = (own.text("column"), own.text("unit"))
-        if commands_time[1] not in TIME_UNITS:
-            own.fault("unit", listed(TIME_UNITS, commands_time[1]))
-        own.close()
+    time = _time(top.table("time"))
+    own = _time(top.table("commands_time")) if "commands_time" in top else None
     entries = top.tables("columns")
     if not entries:
         top.fault("columns", "at least one column")
     columns = tuple(_column(entry, robot.joint_names if robot else None) for entry in entries)
     top.close()
     _note_repeated(faults, columns)
-    return ColumnMap(time_column, time_unit, columns, delimiter, commands_time), faults.all()
+    return ColumnMap(*time, columns, delimiter, own), faults.all()
+
+
+def _time(table: Table) -> tuple[str, str]:
+    column, unit = table.text("column"), table.text("unit")
+    if unit not in TIME_UNITS:
+        table.fault("unit", listed(TIME_UNITS, unit))
+    table.close()
+    return column, unit
 
 
 def _column(table: Table, joints: Iterable[str] | None) -> Column:

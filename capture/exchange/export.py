@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,38 +25,32 @@ from numpy.typing import NDArray
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
-from ..common.errors import MissingChannelError, MissingExtraError, UsageError
+from ..common.errors import MissingChannelError, UsageError
 from ..common.files import as_text, check_stop, csv_writer, number_cells, part_file
 from ..common.process import StopRequest
+from ..log.messages import frames as wire
 from ..log.messages.definitions import JOINT_STATE
-from ..log.messages.frames import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-)
+from ..log.messages.frames import FrameArray
 from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
+from .column_blocks import arrow
 from .frame_formats import FRAME_FORMATS
 from .frame_log import LogBlock, chosen_buses, frame_blocks, frame_facts, is_error, is_remote
 
 _Format = TypeVar("_Format")
 
-_FLAGS = ERROR_FLAG | REMOTE_FLAG | EXTENDED_FLAG
+_FLAGS = wire.ERROR_FLAG | wire.REMOTE_FLAG | wire.EXTENDED_FLAG
 
 _FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
-    "identifier": lambda frames: frames["id_flags"] & ID_MASK,
+    "identifier": lambda frames: frames["id_flags"] & wire.ID_MASK,
     "flags": lambda frames: frames["id_flags"] & _FLAGS,
     "length code": lambda frames: frames["len"],
     "data": lambda frames: frames["data"],
     "direction": lambda frames: frames["dir"],
     "time below 1 us": lambda frames: frames["t_host_ns"],
-    "bit rate switch": lambda frames: frames["fd_flags"] & FD_BRS,
-    "error state": lambda frames: frames["fd_flags"] & FD_ESI,
+    "bit rate switch": lambda frames: frames["fd_flags"] & wire.FD_BRS,
+    "error state": lambda frames: frames["fd_flags"] & wire.FD_ESI,
 }
 """Field of a frame that a format may lose to its values, one row a frame."""
 
@@ -102,19 +96,19 @@ class LossTally:
         ]
 
 
-@dataclass
+@dataclass(frozen=True)
 class ExportReport:
-    """Result of an export of frames.
+    """Result of an export.
 
     Attributes:
-        title: Name of the format.
-        buses: Bus to number of frames written.
+        what: What was written, as a phrase.
+        facts: The same for JSON.
         warnings: Facts that the format doesn't hold or the session lacks, one sentence each.
     """
 
-    title: str
-    buses: dict[str, int]
-    warnings: list[str] = field(default_factory=list[str])
+    what: str
+    facts: dict[str, Any]
+    warnings: list[str]
 
 
 def export_log(
@@ -166,7 +160,9 @@ def export_log(
         elif left_out := sum(facts.fd_counts.values()):
             warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
         warnings += tally.sentences()
-    return ExportReport(chosen.title, counts, warnings)
+    total = sum(counts.values())
+    what = f"{total} frames of {', '.join(counts)}, in the format of {chosen.title}"
+    return ExportReport(what, {"frames": total, "buses": counts}, warnings)
 
 
 def chosen_format(
@@ -184,20 +180,6 @@ def chosen_format(
 
 _MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
-
-
-@dataclass
-class ColumnReport:
-    """Result of an export of columns.
-
-    Attributes:
-        rows: Topic to number of rows.
-        warnings: Missing or doubtful facts, one sentence each.
-    """
-
-    columns: list[str]
-    rows: dict[str, int] = field(default_factory=dict[str, int])
-    warnings: list[str] = field(default_factory=list[str])
 
 
 @dataclass(frozen=True)
@@ -227,7 +209,7 @@ def export_columns(
     topics: Sequence[str] = (),
     force: bool = False,
     stop: StopRequest | None = None,
-) -> ColumnReport:
+) -> ExportReport:
     """Write joint columns of a session as a table.
 
     One topic is held in memory at a time.
@@ -257,24 +239,23 @@ def export_columns(
             )
         wanted = {topic: joint_fields(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
-        report = ColumnReport(["t_ns", "topic", "joint", *columns])
+        rows = dict.fromkeys(wanted, 0)
+        warnings = [f"{topic} carries no values" for topic, found in wanted.items() if not found]
         with (
             part_file(output) as part,
             progress(f"export {output.name}", len(wanted)) as bar,
             open_table(part, columns) as write,
         ):
             for number, (topic, found) in enumerate(wanted.items()):
-                report.rows[topic] = 0
-                if not found:
-                    report.warnings.append(f"{topic} carries no values")
-                    continue
-                for block, done in _blocks(session, topic, found):
+                for block, done in _blocks(session, topic, found) if found else ():
                     write(block)
-                    report.rows[topic] += len(block.t_ns)
+                    rows[topic] += len(block.t_ns)
                     bar.update(number + done)
                     check_stop(output, stop)
-        report.warnings += session.warnings
-    return report
+        warnings += session.warnings
+    total = sum(rows.values())
+    what = f"{total} rows of {', '.join(rows)}"
+    return ExportReport(what, {"rows": total, "topics": rows}, warnings)
 
 
 @contextmanager
@@ -303,17 +284,8 @@ def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
 @contextmanager
 def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
     """Parquet: t_ns int64, topic and joint dictionaries of strings, the rest float64 or null."""
-    try:
-        import pyarrow as pa
-        from pyarrow.parquet import ParquetWriter
-    except ImportError as error:
-        raise MissingExtraError("a .parquet table", "parquet", "pyarrow") from error
-    module: Any = pa  # its types are incomplete
-    text = module.dictionary(module.int32(), module.string())
-    fields: list[Any] = [("t_ns", module.int64()), ("topic", text), ("joint", text)]
-    schema = module.schema([*fields, *((name, module.float64()) for name in columns)])
-    with ParquetWriter(path, schema) as table:
-        writer: Any = table
+    head = {"t_ns": "int64", "topic": "text", "joint": "text"}
+    with open_parquet(path, head, columns) as (module, write_arrays):
 
         def write(block: RowBlock) -> None:
             count = len(block.t_ns)
@@ -329,9 +301,40 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
                 else module.nulls(count, module.float64())
                 for name in columns
             ]
-            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+            write_arrays(arrays)
 
         yield write
+
+
+@contextmanager
+def open_parquet(
+    path: Path, head: Mapping[str, str], numbers: Sequence[str]
+) -> Generator[tuple[Any, Callable[[list[Any]], None]]]:
+    """Create a Parquet table.
+
+    Args:
+        head: First columns to their types: ``int64``, ``float64``, or ``text`` in a dictionary.
+        numbers: Columns of float64 after them.
+
+    Yields:
+        pyarrow, whose types are incomplete, and a function that writes arrays, one a column.
+
+    Raises:
+        MissingExtraError: If pyarrow is not installed.
+    """
+    parquet = arrow("a .parquet table")
+    import pyarrow as pa
+
+    module: Any = pa
+    kinds = {"int64": module.int64(), "float64": module.float64()}
+    kinds["text"] = module.dictionary(module.int32(), module.string())
+    columns = {**head, **dict.fromkeys(numbers, "float64")}
+    schema = module.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    with parquet.ParquetWriter(path, schema) as writer:
+        yield (
+            module,
+            lambda arrays: writer.write_table(module.Table.from_arrays(arrays, schema=schema)),
+        )
 
 
 TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}

@@ -11,12 +11,8 @@ import numpy as np
 
 from ..common.arrays import BoolArray, IntArray
 from ..common.errors import MissingChannelError
+from ..log.messages import frames as wire
 from ..log.messages.frames import (
-    ERROR_FLAG,
-    FD_TOPIC_PREFIX,
-    FRAME_TOPIC_PREFIX,
-    FRAME_TOPIC_PREFIXES,
-    REMOTE_FLAG,
     FrameArray,
     bus_of,
     empty_fd_frames,
@@ -196,12 +192,12 @@ class FrameLog:
 
 def is_error(frames: FrameArray) -> BoolArray:
     """Return which frames are error frames, shape (n,)."""
-    return (frames["id_flags"] & ERROR_FLAG) != 0
+    return (frames["id_flags"] & wire.ERROR_FLAG) != 0
 
 
 def is_remote(frames: FrameArray) -> BoolArray:
     """Return which frames are remote frames and not error frames, shape (n,)."""
-    return ((frames["id_flags"] & REMOTE_FLAG) != 0) & ~is_error(frames)
+    return ((frames["id_flags"] & wire.REMOTE_FLAG) != 0) & ~is_error(frames)
 
 
 _MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
@@ -242,7 +238,7 @@ def chosen_buses(session: SessionView, bus: str | None) -> list[str]:
         MissingChannelError: If the session has no raw frames, or no such bus.
     """
     names = sorted(
-        {bus_of(topic) for topic in session.channels if topic.startswith(FRAME_TOPIC_PREFIXES)}
+        {bus_of(topic) for topic in session.channels if topic.startswith(wire.FRAME_TOPIC_PREFIXES)}
     )
     if not names:
         raise MissingChannelError(session.path, "raw CAN frames", sorted(session.channels))
@@ -267,8 +263,12 @@ def frame_blocks(
         Blocks; the bus of a frame is its index into ``buses``.
     """
     topics = [
-        (prefix + bus, index, session.fd_frames if prefix == FD_TOPIC_PREFIX else session.frames)
-        for prefix in (FRAME_TOPIC_PREFIXES if fd else (FRAME_TOPIC_PREFIX,))
+        (
+            prefix + bus,
+            index,
+            session.fd_frames if prefix == wire.FD_TOPIC_PREFIX else session.frames,
+        )
+        for prefix in (wire.FRAME_TOPIC_PREFIXES if fd else (wire.FRAME_TOPIC_PREFIX,))
         for index, bus in enumerate(buses)
         if prefix + bus in session.channels
     ]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from ..common.process import StopRequest
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
 from .column_blocks import arrow
+from .export import ExportReport
 from .lerobot_import import FEATURES
 
 VERSION = "v3.0"
@@ -53,19 +54,6 @@ _NUMBERING = {
 }
 
 Stats = dict[str, list[float]]
-
-
-@dataclass
-class DatasetReport:
-    """Result of an export of a dataset.
-
-    Attributes:
-        episodes: Frames of each.
-        warnings: What resampling lost and what is not in the dataset, one sentence each.
-    """
-
-    episodes: list[int] = field(default_factory=list[int])
-    warnings: list[str] = field(default_factory=list[str])
 
 
 @dataclass(frozen=True)
@@ -132,7 +120,7 @@ def export_lerobot(
     task: str | None = None,
     force: bool = False,
     stop: StopRequest | None = None,
-) -> DatasetReport:
+) -> ExportReport:
     """Write sessions as a LeRobot dataset, one episode each; one session is open at a time.
 
     Args:
@@ -156,7 +144,7 @@ def export_lerobot(
     if not 1 <= fps <= 1_000_000:
         raise UsageError(f"--fps {fps}: frames a second, 1 to 1000000")
     arrow("a LeRobot dataset")
-    report = DatasetReport()
+    episodes, warnings = list[int](), list[str]()
     with (
         part_folder(output, marker=MARKER, force=force) as part,
         progress(f"export {output.name}", len(sources)) as bar,
@@ -168,14 +156,16 @@ def export_lerobot(
                 with Session.open(source, column_folder=output.parent) as session:
                     episode, notes = read_episode(session, task)
                     notes += _losses(episode, fps)
-                    report.episodes.append(writer.add(episode, lambda: check_stop(output, stop)))
+                    episodes.append(writer.add(episode, lambda: check_stop(output, stop)))
                     notes += session.warnings
                 prefix = f"{source.name}: " if len(sources) > 1 else ""
-                report.warnings += [f"{prefix}{note}" for note in notes]
+                warnings += [f"{prefix}{note}" for note in notes]
         finally:
             writer.close()
         writer.finish()
-    return report
+    count = len(episodes)
+    what = f"{sum(episodes)} frames in {count} episode{'' if count == 1 else 's'}"
+    return ExportReport(what, {"episodes": episodes, "fps": fps}, warnings)
 
 
 def read_episode(session: Session, task: str | None = None) -> tuple[Episode, list[str]]:
@@ -228,9 +218,8 @@ def _held(
     return HeldSignal(joint, t_ns if known.all() else t_ns[known], rounded)
 
 
-def _losses(episode: Episode, fps: int) -> list[str]:
-    """Return what a rate of frames leaves out, one sentence a feature."""
-    sentences: list[str] = []
+def _losses(episode: Episode, fps: int) -> Iterator[str]:
+    """Yield what a rate of frames leaves out, one sentence a feature."""
     frame_ns = episode.frame_ns(np.arange(_checked(episode, fps)), fps)
     for name, signals in episode.features.items():
         total = sum(len(signal.t_ns) for signal in signals)
@@ -241,11 +230,10 @@ def _losses(episode: Episode, fps: int) -> list[str]:
             age_ns = int((frame_ns - signal.t_ns[last]).max())
             if age_ns > oldest_ns:
                 oldest_ns, joint = age_ns, signal.joint
-        sentences.append(
+        yield (
             f"{name} at {fps} frames a second: {total - kept} of {total} samples left out, values "
             f"up to {oldest_ns / NS:.3g} s old ({joint}), rounded to float32"
         )
-    return sentences
 
 
 def _checked(episode: Episode, fps: int) -> int:

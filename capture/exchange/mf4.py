@@ -30,17 +30,8 @@ from numpy.typing import NDArray
 from ..common.arrays import NS, BoolArray, IntArray
 from ..common.errors import ImportFormatError, MissingExtraError
 from ..common.extras import undefer
-from ..log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-    empty_fd_frames,
-)
+from ..log.messages import frames as wire
+from ..log.messages.frames import empty_fd_frames
 from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
 
 
@@ -98,7 +89,11 @@ def _noted(problems: list[str]) -> Generator[None]:
         logger.removeFilter(saying)
 
 
-_KIND_FLAGS = {"CAN_DataFrame": 0, "CAN_RemoteFrame": REMOTE_FLAG, "CAN_ErrorFrame": ERROR_FLAG}
+_KIND_FLAGS = {
+    "CAN_DataFrame": 0,
+    "CAN_RemoteFrame": wire.REMOTE_FLAG,
+    "CAN_ErrorFrame": wire.ERROR_FLAG,
+}
 _LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
 _PLACES: IntArray = np.arange(64)
 _VERSION_4 = (b"MDF", b"UnFinMF")
@@ -268,13 +263,13 @@ class _Reader:
         frames = empty_fd_frames(count)
         none = np.zeros(count, dtype=np.int64)
         identifier = none if (found := numbers("ID")) is None else found
-        extended = identifier & EXTENDED_FLAG != 0
+        extended = identifier & wire.EXTENDED_FLAG != 0
         if (wide := numbers("IDE")) is not None:
             extended |= wide != 0
         if group.kind == "CAN_ErrorFrame":
             extended[:] = False  # an error frame has no identifier, and no width of it
         frames["id_flags"] = (
-            (identifier & ID_MASK) | extended * EXTENDED_FLAG | _KIND_FLAGS[group.kind]
+            (identifier & wire.ID_MASK) | extended * wire.EXTENDED_FLAG | _KIND_FLAGS[group.kind]
         )
         data, size = column("DataBytes"), numbers("DataLength")
         dlc = numbers("DLC")
@@ -301,7 +296,7 @@ def _fd_facts(
     if (longer := numbers("EDL")) is not None:
         is_fd |= longer != 0
     is_fd &= kind != "CAN_ErrorFrame"
-    for name, flag in (("BRS", FD_BRS), ("ESI", FD_ESI)):
+    for name, flag in (("BRS", wire.FD_BRS), ("ESI", wire.FD_ESI)):
         if (found := numbers(name)) is not None:
             flags[is_fd & (found != 0)] |= flag
     return is_fd, flags
@@ -310,10 +305,10 @@ def _fd_facts(
 def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
     """Convert directions, numbers or the texts Rx and Tx."""
     if column is None:
-        return np.full(count, DIR_RX, dtype=np.uint8)
+        return np.full(count, wire.DIR_RX, dtype=np.uint8)
     texts = column.dtype.kind in "SU"
     sent = np.char.lower(column.astype("S")) == b"tx" if texts else column != 0
-    return np.where(sent, DIR_TX, DIR_RX).astype(np.uint8)
+    return np.where(sent, wire.DIR_TX, wire.DIR_RX).astype(np.uint8)
 
 
 def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> Iterator[LogBlock]:

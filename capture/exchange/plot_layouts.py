@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -22,11 +22,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from ..bus.decoded_topics import JOINT_TOPIC
-from ..common.console import plain, refuse_existing
-from ..common.errors import DataError, MissingChannelError, UsageError, some_names
-from ..common.files import write_text
+from ..common.console import plain
+from ..common.errors import DataError, MissingChannelError, some_names
+from ..common.files import check_output, check_stop, write_text
+from ..common.process import StopRequest
 from ..log.read.session import Session
 from ..robot.model import Quantity
+from .export import ExportReport
 
 _PER_TAB = 6
 _COLORS = ("#7f7f7f", "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e")
@@ -58,86 +60,84 @@ class JointPlot:
     curves: tuple[Curve, ...]
 
 
-@dataclass
-class LayoutReport:
-    """Result of an export of a layout.
-
-    Attributes:
-        joints: Joints that have a plot.
-        warnings: What has none, one sentence each.
-    """
-
-    joints: list[str] = field(default_factory=list[str])
-    warnings: list[str] = field(default_factory=list[str])
-
-
 def export_foxglove_layout(
-    source: Path, output: Path, *, topics: Sequence[str] = (), force: bool = False
-) -> LayoutReport:
+    source: Path,
+    output: Path,
+    *,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ExportReport:
     """Write a layout for Foxglove.
 
     Args:
         output: A name that ends in .json.
         topics: JointState topics; commands and states if none.
         force: Replace the file if it exists.
+        stop: Ends the export, with nothing left behind.
 
     Raises:
         UsageError: If the name ends in anything else.
         OutputExistsError: If the output is there and ``force`` is not given.
         MissingChannelError: If the session has no such topic.
         DataError: If a topic is not of JointStates, or no joint can be shown.
-        LogWriteError: If the output can't be written.
+        LogWriteError: If the output can't be written or the export was stopped.
     """
-    _check(output, ".json", force=force)
-    plots, _, report = _plots(source, output, topics)
+    check_output(output, (".json",), "end the name of this layout in .json", force=force)
+    plots, _, warnings = _plots(source, output, topics)
     placed = [
         JointPlot(plot.joint, tuple(c for c in plot.curves if c.place is not None))
         for plot in plots
     ]
     if moving := [plot.joint for plot in plots if any(c.place is None for c in plot.curves)]:
-        report.warnings.append(
+        warnings.append(
             "Foxglove finds joints by their place in the message, which changes here, so these "
             f"have no curve: {some_names(moving, 10)}"
         )
     shown = [plot for plot in placed if plot.curves]
     if not shown:
         raise DataError(f"{source}: Foxglove can't show its joints, whose places change")
-    report.joints = [plot.joint for plot in shown]
+    check_stop(output, stop)
     write_text(output, json.dumps(foxglove_layout(shown), indent=2) + "\n")
-    return report
+    return _report(shown, warnings)
 
 
 def export_plotjuggler_layout(
-    source: Path, output: Path, *, topics: Sequence[str] = (), force: bool = False
-) -> LayoutReport:
+    source: Path,
+    output: Path,
+    *,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ExportReport:
     """Write a layout for PlotJuggler; see :func:`export_foxglove_layout`.
 
     Args:
         output: A name that ends in .xml.
         topics: JointState topics; commands and states if none.
         force: Replace the file if it exists.
+        stop: Ends the export, with nothing left behind.
     """
-    _check(output, ".xml", force=force)
-    plots, duration_s, report = _plots(source, output, topics)
+    check_output(output, (".xml",), "end the name of this layout in .xml", force=force)
+    plots, duration_s, warnings = _plots(source, output, topics)
     named = [plot for plot in plots if plain(plot.joint) == plot.joint]
     if odd := [plot.joint for plot in plots if plot not in named]:
-        report.warnings.append(f"names that XML can't hold, left out: {some_names(odd, 10)}")
+        warnings.append(f"names that XML can't hold, left out: {some_names(odd, 10)}")
     if not named:
         raise DataError(f"{source}: XML can't hold the names of its joints")
-    report.joints = [plot.joint for plot in named]
+    check_stop(output, stop)
     write_text(output, plotjuggler_layout(named, duration_s))
-    return report
+    return _report(named, warnings)
 
 
-def _check(output: Path, suffix: str, *, force: bool) -> None:
-    if output.suffix.lower() != suffix:
-        raise UsageError(f"{output}: end the name of this layout in {suffix}")
-    refuse_existing(output, force=force)
+def _report(plots: Sequence[JointPlot], warnings: list[str]) -> ExportReport:
+    joints = [plot.joint for plot in plots]
+    return ExportReport(f"plots of {len(joints)} joints", {"joints": joints}, warnings)
 
 
 def _plots(
     source: Path, output: Path, topics: Sequence[str]
-) -> tuple[list[JointPlot], float, LayoutReport]:
+) -> tuple[list[JointPlot], float, list[str]]:
     """Return the plots of a session, its length [s], and the report to fill."""
     usual = [JOINT_TOPIC[Quantity.COMMAND], JOINT_TOPIC[Quantity.POSITION]]
     with Session.open(source, column_folder=output.parent) as session:
@@ -156,9 +156,8 @@ def _plots(
                 low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0, 0)
                 curve = Curve(topic, places.get(joint), color, low, high)
                 curves.setdefault(joint, []).append(curve)
-        report = LayoutReport(warnings=session.warnings)
-        duration_s = session.duration_s
-    return [JointPlot(name, tuple(own)) for name, own in curves.items()], duration_s, report
+        plots = [JointPlot(name, tuple(own)) for name, own in curves.items()]
+        return plots, session.duration_s, session.warnings
 
 
 def _places(orders: Sequence[tuple[str, ...]]) -> dict[str, int]:

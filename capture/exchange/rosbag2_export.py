@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +24,7 @@ from ..common.process import StopRequest
 from ..log.edited_log import EditedLog, RawLog
 from ..log.file.bag_metadata import METADATA, is_rosbag2
 from ..log.messages.definitions import is_latched
+from .export import ExportReport
 
 MARKER = Path(METADATA)
 """The file by which a folder is a bag."""
@@ -47,22 +49,9 @@ _LATCHED = {
 _TOPIC_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
-@dataclass
-class BagReport:
-    """Result of an export of a bag.
-
-    Attributes:
-        messages: Topic to number of messages.
-        warnings: Missing or doubtful parts, one sentence each.
-    """
-
-    messages: dict[str, int] = field(default_factory=dict[str, int])
-    warnings: list[str] = field(default_factory=list[str])
-
-
 def export_rosbag2(
     source: Path, output: Path, *, force: bool = False, stop: StopRequest | None = None
-) -> BagReport:
+) -> ExportReport:
     """Write a session as a rosbag2 folder.
 
     Args:
@@ -101,18 +90,19 @@ def export_rosbag2(
             raise DataError(f"{source}: has no messages of ROS 2 (CDR with a ros2msg schema)")
         text = _metadata(log, kept, copy, file.name)
         (part / MARKER).write_text(text, encoding="utf-8")
-        report = BagReport(dict(sorted(copy.counts.items())), list(log.warnings))
+        messages, warnings = dict(sorted(copy.counts.items())), list(log.warnings)
         topics = {channel.topic for channel in kept}
         left_out = {channel.topic for channel in log.file.channels.values()} - topics
     if left_out:
         names = some_names(sorted(left_out), 10)
-        report.warnings.append(f"not messages of ROS 2, left out: {names}")
+        warnings.append(f"not messages of ROS 2, left out: {names}")
     if odd := sorted(topic for topic in topics if not _TOPIC_NAME.fullmatch(topic)):
-        report.warnings.append(
+        warnings.append(
             f"ROS 2 can't publish topics of these names, use --remap or --topics of ros2 bag play: "
             f"{some_names(odd, 10)}"
         )
-    return report
+    what = f"{sum(messages.values())} messages of {len(messages)} topics"
+    return ExportReport(what, {"messages": messages}, warnings)
 
 
 def _is_ros(log: RawLog, channel: Channel) -> bool:
@@ -179,17 +169,16 @@ def _metadata(log: RawLog, channels: list[Channel], copy: EditedLog, file: str) 
     return "\n".join(_yaml({"rosbag2_bagfile_information": facts})) + "\n"
 
 
-def _yaml(value: Any, indent: str = "") -> list[str]:
-    """Return the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
-    lines: list[str] = []
+def _yaml(value: Any, indent: str = "") -> Iterator[str]:
+    """Yield the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
     if isinstance(value, list):
         for item in cast("list[Any]", value):
-            own = _yaml(item, indent + "  ") if isinstance(item, dict) else [json.dumps(item)]
-            lines += [f"{indent}- {own[0].strip()}", *own[1:]]
-        return lines
+            own = [*_yaml(item, indent + "  ")] if isinstance(item, dict) else [json.dumps(item)]
+            yield from (f"{indent}- {own[0].strip()}", *own[1:])
+        return
     for key, item in cast("dict[str, Any]", value).items():
         if item and isinstance(item, dict | list):
-            lines += [f"{indent}{key}:", *_yaml(item, indent + "  ")]
+            yield f"{indent}{key}:"
+            yield from _yaml(item, indent + "  ")
         else:
-            lines.append(f"{indent}{key}: {json.dumps(item)}")
-    return lines
+            yield f"{indent}{key}: {json.dumps(item)}"

@@ -220,8 +220,7 @@ def _meaning(name: str, role: str, *, headerless: bool) -> _Name:
     pivot = re.search(r"\[([^\[\]]+)\]$", name)
     place = pivot.group(1) if pivot and pivot.group(1) not in UNITS else ""
     base = name[: pivot.start()] if pivot and place else name
-    every = tuple(UNITS)
-    unit = _named_unit(base, every)
+    unit = _named_unit(base, tuple(UNITS))
     plain = re.sub(r"[\[(][^\[\]()]*[\])]", "", base)
     found = words(plain)
     commanded = role == COMMANDS or bool(_COMMAND.intersection(found))
@@ -247,13 +246,10 @@ def _rest(name: str, unit: str) -> str:
     numbers = re.findall(r"\d+", name)
     if numbers and not any(re.search(r"[A-Za-z]", part) for part in kept):
         return f"joint{int(numbers[-1]):02d}" if len(numbers[-1]) < 7 else ""
-    kept = kept if any(re.search(r"\d", part) for part in kept) else _without_fillers(kept)
+    if not any(re.search(r"\d", part) for part in kept):
+        kept = [part for part in kept if part.lower() not in _FILLERS]
     rest = "_".join(kept)
     return _identifier(rest) if len(rest) > 1 else ""
-
-
-def _without_fillers(parts: list[str]) -> list[str]:
-    return [part for part in parts if part.lower() not in _FILLERS]
 
 
 def _says_quantity(part: str) -> bool:
@@ -308,7 +304,9 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
                         f"{taken[joint, quantity]}")  # fmt: skip
             continue
         taken[joint, quantity] = name
-        unit = units.get(quantity) or (meaning.unit if _fits(meaning.unit, quantity) else "")
+        unit = units.get(quantity) or (
+            meaning.unit if meaning.unit in valid_units(quantity) else ""
+        )
         if not unit:
             assumed[quantity] = unit = SESSION_UNIT[quantity]
         stated = _STATED.fullmatch(name) is not None
@@ -322,10 +320,6 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
         for quantity, unit in assumed.items()
     ]
     return columns
-
-
-def _fits(unit: str, quantity: Quantity) -> bool:
-    return unit in valid_units(quantity)
 
 
 def _single_joint(

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TextIO, cast
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError
+from ..common.errors import ImportFormatError, raised_as
 from ..common.strict_table import listed
 from .array_files import read_mat, read_npz, read_tensors
 from .column_blocks import (
@@ -114,11 +114,18 @@ def open_csv(path: Path, time: str, columns: Sequence[str], delimiter: str) -> T
 
 @contextmanager
 def _rows(path: Path, delimiter: str) -> Generator[Iterator[list[str]]]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            yield csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
+    with _text(path) as stream:
+        yield csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+
+
+@contextmanager
+def _text(path: Path) -> Generator[TextIO]:
+    caught = (OSError, UnicodeDecodeError, csv.Error)
+    with (
+        raised_as(ImportFormatError, path, "can't be read", *caught),
+        path.open(encoding="utf-8-sig", newline="") as stream,
+    ):
+        yield stream
 
 
 def _read_csv(
@@ -237,11 +244,8 @@ def _open_parquet(path: Path) -> TableFile:
 
 
 def _open_text(path: Path) -> TableFile:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            head = stream.read(_SNIFFED)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
+    with _text(path) as stream:
+        head = stream.read(_SNIFFED)
     lines = head.splitlines()
     lines = lines[:-1] if len(head) == _SNIFFED and len(lines) > 1 else lines
     skipped = next((i for i, line in enumerate(lines) if line.strip(" \t#%")), len(lines))

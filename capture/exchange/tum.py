@@ -10,18 +10,19 @@ Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..common.arrays import NS, FloatArray, IntArray
-from ..common.console import plain, progress, refuse_existing
-from ..common.errors import DataError, MissingChannelError, UsageError, some_names
-from ..common.files import check_stop, part_file
+from ..common.console import plain, progress
+from ..common.errors import DataError, MissingChannelError, some_names
+from ..common.files import check_output, check_stop, part_file
 from ..common.process import StopRequest
 from ..log.read.sample_times import clock_shift_ns
 from ..log.read.session import Session
+from .export import ExportReport
 
 SUFFIXES = (".tum", ".txt")
 
@@ -56,22 +57,6 @@ class Trajectory:
     poses: FloatArray
 
 
-@dataclass
-class TrajectoryReport:
-    """Result of an export of a trajectory.
-
-    Attributes:
-        poses: Number of lines.
-        warnings: Missing or doubtful parts, one sentence each.
-    """
-
-    topic: str
-    frame: str
-    parent: str
-    poses: int
-    warnings: list[str] = field(default_factory=list[str])
-
-
 def export_tum(
     source: Path,
     output: Path,
@@ -79,7 +64,7 @@ def export_tum(
     frame: str | None = None,
     force: bool = False,
     stop: StopRequest | None = None,
-) -> TrajectoryReport:
+) -> ExportReport:
     """Write the poses of a frame as a TUM trajectory, in order of time.
 
     Args:
@@ -95,9 +80,8 @@ def export_tum(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    if output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{output}: end the name of a trajectory in {' or '.join(SUFFIXES)}")
-    refuse_existing(output, force=force)
+    why = f"end the name of a trajectory in {' or '.join(SUFFIXES)}"
+    check_output(output, SUFFIXES, why, force=force)
     with Session.open(source) as session:
         found = read_trajectory(session, frame)
         warnings = session.warnings
@@ -124,7 +108,9 @@ def export_tum(
             stream.writelines(_lines(found.t_ns[rows], found.poses[rows]))
             bar.update(start)
             check_stop(output, stop)
-    return TrajectoryReport(found.topic, found.frame, parent, len(order), warnings)
+    what = f"{len(order)} poses of {found.frame} in {parent}, from {found.topic}"
+    facts = {"poses": len(order), "frame": found.frame, "parent": parent, "topic": found.topic}
+    return ExportReport(what, facts, warnings)
 
 
 def _lines(t_ns: IntArray, poses: FloatArray) -> Iterator[str]:
@@ -146,7 +132,8 @@ def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
         DataError: If it has no such frame; names those that it has.
     """
     kinds = {topic: channel.type_name for topic, channel in session.channels.items()}
-    posed = sorted((t for t, kind in kinds.items() if kind in _POSE_FIELD), key=_odometry_first)
+    posed = [topic for topic, kind in kinds.items() if kind in _POSE_FIELD]
+    posed.sort(key=lambda topic: (topic != "/odom", topic))
     moved = [topic for topic, kind in kinds.items() if kind == _TRANSFORMS]
     if not posed and not moved:
         raise MissingChannelError(session.path, "poses", sorted(kinds))
@@ -162,10 +149,6 @@ def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
         asked = "no Odometry, so name one (--frame)" if frame is None else f"no frame {frame!r}"
         raise DataError(f"{session.path}: has {asked}; it has {names}")
     return found
-
-
-def _odometry_first(topic: str) -> tuple[bool, str]:
-    return topic != "/odom", topic
 
 
 def _of_poses(session: Session, topic: str, kind: str) -> Iterator[Trajectory]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,7 @@ from ..common.strict_table import NAME_PATTERN
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import Quantity
-from .column_blocks import arrow
-from .export import chosen_format, joint_fields, joint_topics
+from .export import ExportReport, chosen_format, joint_fields, joint_topics, open_parquet
 
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block
@@ -147,19 +146,6 @@ def _rows(parts: Sequence[tuple[IntArray, slice]]) -> tuple[IntArray, list[IntAr
     return t_ns[order][is_new], np.split(rows, cuts)
 
 
-@dataclass
-class WideReport:
-    """Result of an export of a wide table.
-
-    Attributes:
-        warnings: Missing or doubtful facts, one sentence each.
-    """
-
-    columns: list[str]
-    rows: int = 0
-    warnings: list[str] = field(default_factory=list[str])
-
-
 def export_wide(
     source: Path,
     output: Path,
@@ -167,7 +153,7 @@ def export_wide(
     topics: Sequence[str] = (),
     force: bool = False,
     stop: StopRequest | None = None,
-) -> WideReport:
+) -> ExportReport:
     """Write joint columns of a session as a wide table.
 
     The columns are held in files without names beside the output where they are large.
@@ -191,8 +177,7 @@ def export_wide(
     with Session.open(source, column_folder=output.parent) as session:
         columns, warnings = wide_columns(session, topics)
         names = [column.name for column in columns]
-        report = WideReport(["t_ns", "time [s]", *names], warnings=warnings)
-        start_ns, samples = min(int(column.t_ns[0]) for column in columns), 0
+        start_ns, count, samples = min(int(column.t_ns[0]) for column in columns), 0, 0
         with (
             part_file(output) as part,
             progress(f"export {output.name}", 1.0) as bar,
@@ -202,24 +187,26 @@ def export_wide(
                 if number % _FORGET_EVERY == 0:
                     session.forget()
                 write(block)
-                report.rows += len(block.t_ns)
+                count += len(block.t_ns)
                 samples += sum(len(rows) for rows, _ in block.cells.values())
-                if report.rows * len(names) > max(_MOST_SPARSE, _LEAST_FILLED * samples):
+                if count * len(names) > max(_MOST_SPARSE, _LEAST_FILLED * samples):
                     raise UsageError(
                         f"{source}: a wide table of {len(names)} columns would be empty but for "
-                        f"{samples / (report.rows * len(names)):.1%} of its cells; choose columns "
+                        f"{samples / (count * len(names)):.1%} of its cells; choose columns "
                         "with --topics, or the long table (without --to wide)"
                     )
                 bar.update(block.done)
                 check_stop(output, stop)
-        empty = 1.0 - samples / (report.rows * len(columns))
+        empty = 1.0 - samples / (count * len(columns))
         if empty > 0.5:
-            report.warnings.append(
+            warnings.append(
                 f"{empty:.0%} of the cells are empty: joints were sampled at times of their own; "
                 "the long table (without --to wide) has no such cells"
             )
-        report.warnings += session.warnings
-    return report
+        warnings += session.warnings
+    names = ["t_ns", "time [s]", *names]
+    what = f"{count} rows of {len(names)} columns"
+    return ExportReport(what, {"rows": count, "columns": names}, warnings)
 
 
 def wide_columns(
@@ -305,13 +292,7 @@ def _open_csv(path: Path, names: Sequence[str], start_ns: int) -> Generator[Writ
 @contextmanager
 def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
     """Parquet: t_ns int64, the rest float64, null where a column has no sample."""
-    parquet = arrow("a .parquet table")
-    import pyarrow as pa
-
-    module: Any = pa  # its types are incomplete
-    fields: list[Any] = [("t_ns", module.int64()), ("time [s]", module.float64())]
-    schema = module.schema([*fields, *((name, module.float64()) for name in names)])
-    with parquet.ParquetWriter(path, schema) as writer:
+    with open_parquet(path, {"t_ns": "int64"}, ["time [s]", *names]) as (module, write_arrays):
 
         def write(block: WideBlock) -> None:
             count = len(block.t_ns)
@@ -326,7 +307,7 @@ def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[
                 cells[rows], missing[rows] = values, False
                 cells[missing] = 0.0
                 arrays.append(module.array(cells, mask=missing, from_pandas=False))
-            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+            write_arrays(arrays)
 
         yield write
 

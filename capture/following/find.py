@@ -17,7 +17,9 @@ from scipy.special import bdtrc
 from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
 from ..common.process import in_threads
+from ..log.messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..log.read.facts import TIMES_FROM_FPS
+from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
 from ..log.read.session_view import SessionView
 from .excursions import Excursions, departures, find_excursions, find_holds
@@ -354,11 +356,11 @@ def _from_residuals(
 
     excursions = in_threads(of_joint, kept, samples)
     spans = [found.spans_s for found in excursions]
-    result: dict[str, list[Symptom]] = {}
-    for k, (each, found) in enumerate(zip(kept, excursions, strict=True)):
-        alone = [not _shared(span, spans, k) for span in found.spans_s]
-        result[each.motion.name] = departures(each.response, found, alone, loaded=each.loaded)
-    return result
+    alone = [[not _shared(span, spans, k) for span in own] for k, own in enumerate(spans)]
+    return {
+        each.motion.name: departures(each.response, found, own, loaded=each.loaded)
+        for each, found, own in zip(kept, excursions, alone, strict=True)
+    }
 
 
 def _shared(span: Span, spans: Sequence[Sequence[Span]], own: int) -> bool:
@@ -371,8 +373,6 @@ def _shared(span: Span, spans: Sequence[Sequence[Span]], own: int) -> bool:
     )
 
 
-COMMANDS = "/joint_commands"
-STATES = "/joint_states"
 MOST_JOINTS = 2000
 """Of a session whose joints are judged; a file that claims more of them describes no robot."""
 
@@ -391,10 +391,8 @@ def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
     """
     session = session.with_joints()
     quantities = {
-        "command": (COMMANDS, "position"),
-        "position": (STATES, "position"),
-        "velocity": (STATES, "velocity"),
-        "effort": (STATES, "effort"),
+        "command": (COMMAND_TOPIC, "position"),
+        **{field: (RESPONSE_TOPIC, field) for field in UNITS},
         "current": ("/joint_current", "position"),
     }
     columns: dict[str, dict[str, Signal]] = {}

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,9 +33,6 @@ from .motion import (
     windowed_response,
     within,
 )
-
-if TYPE_CHECKING:
-    from .motion import Judged
 
 # Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction.
 POWERLESS = 0.2

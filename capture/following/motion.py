@@ -19,7 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..common.arrays import BoolArray, ComplexArray, FloatArray
+from ..common.arrays import BoolArray, ComplexArray, FloatArray, merged_ranges
 from .fault import Span
 
 BLOCKS = 4
@@ -372,13 +372,8 @@ def judge(motion: JointMotion, response: Response, common: complex) -> Judged:
 
 def marked_spans(response: Response, marked: BoolArray) -> tuple[Span, ...]:
     """Return marked windows as time spans [s], overlapping ones joined."""
-    spans: list[Span] = []
-    for start, stop in zip(response.start_s[marked], response.stop_s[marked], strict=True):
-        if spans and start <= spans[-1][1]:
-            spans[-1] = (spans[-1][0], float(stop))
-        else:
-            spans.append((float(start), float(stop)))
-    return tuple(spans)
+    windows = zip(response.start_s[marked].tolist(), response.stop_s[marked].tolist(), strict=True)
+    return tuple(merged_ranges(windows, 0.0))
 
 
 def whole_or(spans: tuple[Span, ...], response: Response) -> tuple[Span, ...]:

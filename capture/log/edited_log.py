@@ -9,7 +9,6 @@ An edit never decodes a message: a copy keeps its bytes, sequence number and pub
 
 from __future__ import annotations
 
-import hashlib
 import json
 import struct
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
@@ -24,9 +23,10 @@ from mcap.records import Attachment, Channel, Metadata
 from ..common.arrays import NS
 from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, LogError, UndulogError, UsageError
-from ..common.files import part_file
+from ..common.files import Closing, part_file
 from ..common.process import StopRequest
 from ..common.strict_table import read_toml
+from .file.content import sha256_of
 from .file.log_file import LogFile
 from .mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
 from .mcap.writer import McapWriter
@@ -54,7 +54,7 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class RawLog:
+class RawLog(Closing):
     """A log opened for its bytes; ``with`` releases it."""
 
     def __init__(self, path: Path) -> None:
@@ -71,18 +71,14 @@ class RawLog:
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
         self.paths = [file.path for file in self.file.files]
-        self.sha256 = _hash(self.paths)
+        self.sha256 = sha256_of(self.paths)
         filled = [block for block in self.file.blocks if block.end_ns]
         self.start_ns = min((block.start_ns for block in filled), default=0)
         self.end_ns = max((block.end_ns for block in filled), default=0)
         self.session_id = self.file.session_id
         self.robot = _robot_name(self.file)
 
-    def __enter__(self) -> RawLog:
-        """Return the log."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Release the file."""
         self.file.close()
 
@@ -195,15 +191,6 @@ class RawLog:
                 f"{self.path}: the last {stop - end} bytes of the chunk at byte {block.start} "
                 "are no whole record: left out"
             )
-
-
-def _hash(paths: list[Path]) -> str:
-    """Return the SHA-256 of one file, or of all parts one after the other."""
-    total = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as stream:
-            hashlib.file_digest(stream, lambda: total)
-    return total.hexdigest()
 
 
 def _robot_name(log_file: LogFile) -> str:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
-from typing import cast
 
 from mcap.records import Schema
 
@@ -44,11 +43,10 @@ from .edited_log import (
     refuse_output,
 )
 from .messages.cdr import layout_of
-from .messages.definitions import JOINT_STATE, parse_message_type
+from .messages.definitions import JOINT_STATE, VERDICTS, parse_message_type, stated_reasons
 
 Record = tuple[str, dict[str, str]]
 
-_VERDICTS = ("good", "degraded", "bad")
 _SESSION_RECORD = "undulog"
 
 
@@ -140,7 +138,7 @@ def _merged_health(sources: Sequence[RawLog]) -> dict[str, str]:
     if len(stated) == len(sources) and all(other == facts[0] for other in facts):
         return facts[0]
     verdicts = [entry.get("verdict", "") for entry in facts]
-    worst = max(verdicts, key=lambda v: _VERDICTS.index(v) if v in _VERDICTS else len(_VERDICTS))
+    worst = max(verdicts, key=lambda v: VERDICTS.index(v) if v in VERDICTS else len(VERDICTS))
     reasons = [
         f"{source.path.name}: {reason}"
         for source in sources
@@ -152,13 +150,7 @@ def _merged_health(sources: Sequence[RawLog]) -> dict[str, str]:
 def _reasons(health: dict[str, str] | None) -> list[str]:
     if health is None:
         return ["states no verdict"]
-    text = health.get("reasons", "[]")
-    try:
-        reasons: object = json.loads(text)
-    except (ValueError, RecursionError):
-        reasons = [text]
-    listed = cast("list[object]", reasons) if isinstance(reasons, list) else [reasons]
-    return [health.get("verdict", "no verdict"), *map(str, listed)]
+    return [health.get("verdict", "no verdict"), *stated_reasons(health)]
 
 
 LONGEST_MERGE_GAP_S = 86400.0
@@ -318,23 +310,21 @@ def _definition(schema: Schema) -> object:
     return schema.data
 
 
-def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
+def _other_robots(sources: Sequence[RawLog], robot: str) -> Iterator[str]:
     """Warn of logs that are not, or probably not, of the merged session's robot."""
-    warnings = [
-        f"{source.path} is of {source.robot}, not of {robot}: its messages are merged all the same"
-        for source in sources
-        if source.robot and source.robot != robot
-    ]
+    for source in sources:
+        if source.robot and source.robot != robot:
+            fact = f"{source.path} is of {source.robot}, not of {robot}"
+            yield f"{fact}: its messages are merged all the same"
     joints = [(source, _joint_names(source)) for source in sources]
     for (one, names), (other, others) in combinations(joints, 2):
         unstated = not one.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
             here, there = (some_names(sorted(each), 3) for each in (names, others))
-            warnings.append(
+            yield (
                 f"{one.path} has {here}, {other.path} has {there}: no joint "
                 "is in both, are they of one robot?"
             )
-    return warnings
 
 
 def _joint_names(source: RawLog) -> set[str]:
@@ -348,9 +338,8 @@ def _joint_names(source: RawLog) -> set[str]:
     return found
 
 
-def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
+def _apart(sources: Sequence[RawLog], *, allowed: bool) -> Iterator[str]:
     """Warn of logs with time between them, and refuse those that are far apart."""
-    warnings: list[str] = []
     ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
     for k, later in enumerate(ordered[1:], start=1):
         earlier = max(ordered[:k], key=lambda each: each.end_ns)
@@ -359,8 +348,7 @@ def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
         if gap_s > LONGEST_MERGE_GAP_S and not allowed:
             raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
         if gap_s > _LATER_S:
-            warnings.append(sentence)
-    return warnings
+            yield sentence
 
 
 def _span(seconds: float) -> str:
@@ -370,21 +358,19 @@ def _span(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def _mixed(sources: Sequence[RawLog]) -> list[str]:
+def _mixed(sources: Sequence[RawLog]) -> Iterator[str]:
     """Warn of logs that hold the same topics at the same times."""
-    warnings: list[str] = []
     for one, other in combinations(sources, 2):
         start, stop = max(one.start_ns, other.start_ns), min(one.end_ns, other.end_ns)
         topics = {c.topic for c in one.file.channels.values() if one.file.counts.get(c.id)} & {
             c.topic for c in other.file.channels.values() if other.file.counts.get(c.id)
         }
         if start <= stop and topics:
-            warnings.append(
+            yield (
                 f"{one.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
                 f"{len(topics)} topics ({', '.join(sorted(topics)[:3])}"
                 f"{', ...' if len(topics) > 3 else ''}): their messages are mixed"
             )
-    return warnings
 
 
 def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMessage]]:

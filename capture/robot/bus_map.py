@@ -48,37 +48,22 @@ class Unit:
 _STANDARD_GRAVITY = 9.80665  # m/s^2, 3rd CGPM 1901
 _TURN = 2 * math.pi
 
+_FACTORS: dict[str, dict[str, float]] = {
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": _TURN},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rev/s": _TURN, "rpm": _TURN / 60},
+    "N m": {"N m": 1.0, "mN m": 1e-3, "kgf cm": _STANDARD_GRAVITY / 100},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "V": {"V": 1.0, "mV": 1e-3},
+    "degC": {"degC": 1.0, "K": 1.0},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s^2": {"m/s^2": 1.0, "g": _STANDARD_GRAVITY, "mg": _STANDARD_GRAVITY / 1000},
+    "T": {"T": 1.0, "uT": 1e-6, "G": 1e-4},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}
 UNITS: dict[str, Unit] = {
-    "rad": Unit("rad", 1.0),
-    "mrad": Unit("rad", 1e-3),
-    "deg": Unit("rad", math.pi / 180),
-    "rev": Unit("rad", _TURN),
-    "rad/s": Unit("rad/s", 1.0),
-    "deg/s": Unit("rad/s", math.pi / 180),
-    "rev/s": Unit("rad/s", _TURN),
-    "rpm": Unit("rad/s", _TURN / 60),
-    "N m": Unit("N m", 1.0),
-    "mN m": Unit("N m", 1e-3),
-    "kgf cm": Unit("N m", _STANDARD_GRAVITY / 100),
-    "A": Unit("A", 1.0),
-    "mA": Unit("A", 1e-3),
-    "V": Unit("V", 1.0),
-    "mV": Unit("V", 1e-3),
-    "degC": Unit("degC", 1.0),
-    "K": Unit("degC", 1.0, -273.15),
-    "m": Unit("m", 1.0),
-    "cm": Unit("m", 1e-2),
-    "mm": Unit("m", 1e-3),
-    "m/s^2": Unit("m/s^2", 1.0),
-    "g": Unit("m/s^2", _STANDARD_GRAVITY),
-    "mg": Unit("m/s^2", _STANDARD_GRAVITY / 1000),
-    "T": Unit("T", 1.0),
-    "uT": Unit("T", 1e-6),
-    "G": Unit("T", 1e-4),
-    "s": Unit("s", 1.0),
-    "ms": Unit("s", 1e-3),
-    "us": Unit("s", 1e-6),
-    "ns": Unit("s", 1e-9),
+    name: Unit(dimension, factor, -273.15 if name == "K" else 0.0)
+    for dimension, factors in _FACTORS.items()
+    for name, factor in factors.items()
 }
 """Every unit that a robot description or a column map may name."""
 

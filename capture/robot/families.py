@@ -86,10 +86,23 @@ def dbc_text(frames: Mapping[str, Frame]) -> str:
     return "\n".join([*lines, "", *extra, ""])
 
 
-def _mapped(name: str, bits: str, most: float, length: int, **meaning: object) -> Field:
+def _mapped(name: str, bits: str, most: float, **meaning: object) -> Field:
     """Return a number that spans -most to most, both included, as MIT's mini-cheetah has it."""
+    length = int(bits[bits.index("|") + 1 : bits.index("@")])
     scale = 2 * most / ((1 << length) - 1)
     return Field(name, bits, scale=scale, offset=-most, **meaning)  # pyright: ignore[reportArgumentType]
+
+
+def _state(
+    places: tuple[str, str, str], most: tuple[float, float, float], selector: tuple[int, ...] = ()
+) -> tuple[Field, ...]:
+    """Return position, velocity and torque, which span -most to most."""
+    names = ("position", "velocity", "torque")
+    kinds = (Quantity.POSITION, "rad"), (Quantity.VELOCITY, "rad/s"), (Quantity.EFFORT, "N m")
+    return tuple(
+        _mapped(name, bits, limit, quantity=quantity, unit=unit, selector=selector)
+        for name, bits, limit, (quantity, unit) in zip(names, places, most, kinds, strict=True)
+    )
 
 
 def _mit_command(id_: int, position: float, velocity: float) -> Frame:
@@ -98,11 +111,9 @@ def _mit_command(id_: int, position: float, velocity: float) -> Frame:
     ``FF FF FF FF FF FF FF FC`` and its like (enter, exit, set zero) are no commands, so a position
     of 0xFFFF has no value.
     """
-    command = _mapped(
-        "position_command", "7|16@0+", position, 16, quantity=Quantity.COMMAND, unit="rad",
-        unknown=0xFFFF,
-    )  # fmt: skip
-    return Frame("mit", TX, id_, (command, _mapped("velocity_command", "23|12@0+", velocity, 12)))
+    kind = {"quantity": Quantity.COMMAND, "unit": "rad", "unknown": 0xFFFF}
+    command = _mapped("position_command", "7|16@0+", position, **kind)
+    return Frame("mit", TX, id_, (command, _mapped("velocity_command", "23|12@0+", velocity)))
 
 
 def _mit_reply(
@@ -110,16 +121,10 @@ def _mit_reply(
 ) -> Frame:
     """Motor number, position 16, velocity 12, torque 12 bits, temperature."""
     own = (motor,)
-    position, velocity, torque = most
     fields = (
-        _mapped("position", "15|16@0+", position, 16, quantity=Quantity.POSITION, unit="rad",
-                selector=own),
-        _mapped("velocity", "31|12@0+", velocity, 12, quantity=Quantity.VELOCITY, unit="rad/s",
-                selector=own),
-        _mapped("torque", "35|12@0+", torque, 12, quantity=Quantity.EFFORT, unit="N m",
-                selector=own),
+        *_state(("15|16@0+", "31|12@0+", "35|12@0+"), most, own),
         Field("temperature", "48|8@1+", Quantity.TEMPERATURE, "degC", 1.0, warmth, own),
-    )  # fmt: skip
+    )
     return Frame("reply", RX, id_, fields, "0|4@1+" if low_nibble else "0|8@1+")
 
 
@@ -176,23 +181,20 @@ def _robstride(motor: Motor) -> tuple[Frame, ...]:
     Type 1 has the torque in its identifier, type 2 the motor, its mode and faults:
     :func:`robstride_key` takes away what isn't the type and the motor.
     """
-    position, velocity, torque = _ROBSTRIDE[motor.model]
+    most = _ROBSTRIDE[motor.model]
+    position = _mapped(
+        "position_command", "7|16@0+", most[0], quantity=Quantity.COMMAND, unit="rad"
+    )
 
     def command(selector: int, quantity: Quantity | None) -> Field:
         return Field("loc_ref", "32|32@1-", quantity, "rad", selector=(selector,), is_float=True)
 
     return (
-        Frame("control", TX, 1 << 24 | motor.id, (
-            _mapped("position_command", "7|16@0+", position, 16, quantity=Quantity.COMMAND,
-                    unit="rad"),
-        ), extended=True),
+        Frame("control", TX, 1 << 24 | motor.id, (position,), extended=True),
         Frame("write", TX, 18 << 24 | motor.id, (command(0x7016, Quantity.COMMAND),), "0|16@1+",
               extended=True),
         Frame("feedback", RX, 2 << 24 | motor.id << 8, (
-            _mapped("position", "7|16@0+", position, 16, quantity=Quantity.POSITION, unit="rad"),
-            _mapped("velocity", "23|16@0+", velocity, 16, quantity=Quantity.VELOCITY,
-                    unit="rad/s"),
-            _mapped("torque", "39|16@0+", torque, 16, quantity=Quantity.EFFORT, unit="N m"),
+            *_state(("7|16@0+", "23|16@0+", "39|16@0+"), most),
             Field("temperature", "55|16@0+", Quantity.TEMPERATURE, "degC", 0.1),
         ), extended=True),
     )  # fmt: skip

@@ -70,14 +70,10 @@ class Run:
 
     def record(self) -> dict[str, str]:
         """Return the entries of the metadata record."""
-        ratio = {} if self.drag_ratio is None else {"drag_ratio": self.drag_ratio}
-        values: dict[str, Any] = {
-            "physics_rate_hz": self.physics_rate_hz,
-            "start_heading_rad": self.start_heading_rad,
-            "contact": self.contact,
-            **ratio,
-            "mass_factor": dict(self.mass_factor),
-        }
+        values: dict[str, Any] = {**vars(self), "mass_factor": dict(self.mass_factor)}
+        del values["servo_of"]
+        if self.drag_ratio is None:
+            del values["drag_ratio"]
         for joint, servo in self.servo_of.items():
             values[_SERVO + joint] = {_KEYS[name]: value for name, value in servo.items()}
         return {key: json.dumps(value) for key, value in values.items()}

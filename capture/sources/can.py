@@ -24,18 +24,8 @@ from can.util import cast_from_string
 
 from ..common.errors import SourceError, UsageError
 from ..common.strict_table import listed
-from ..log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_fd_frames,
-    empty_frames,
-)
+from ..log.messages import frames as wire
+from ..log.messages.frames import FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
 from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress, flag, only
 from .events import IMPLAUSIBLE_TIME, Tally
@@ -149,7 +139,8 @@ def frames_of(
         frames = empty_fd_frames(len(messages))
         frames["len"] = [len(m.data) for _, m in messages]
         frames["fd_flags"] = [
-            (FD_BRS if m.bitrate_switch else 0) | (FD_ESI if m.error_state_indicator else 0)
+            (wire.FD_BRS if m.bitrate_switch else 0)
+            | (wire.FD_ESI if m.error_state_indicator else 0)
             for _, m in messages
         ]
     else:
@@ -165,12 +156,12 @@ def frames_of(
         frames["t_device_ns"][given] = micros * np.uint64(1000)
     frames["id_flags"] = [
         m.arbitration_id
-        | (EXTENDED_FLAG if m.is_extended_id and not m.is_error_frame else 0)
-        | (REMOTE_FLAG if m.is_remote_frame else 0)
-        | (ERROR_FLAG if m.is_error_frame else 0)
+        | (wire.EXTENDED_FLAG if m.is_extended_id and not m.is_error_frame else 0)
+        | (wire.REMOTE_FLAG if m.is_remote_frame else 0)
+        | (wire.ERROR_FLAG if m.is_error_frame else 0)
         for _, m in messages
     ]
-    frames["dir"] = [DIR_RX if m.is_rx else DIR_TX for _, m in messages]
+    frames["dir"] = [wire.DIR_RX if m.is_rx else wire.DIR_TX for _, m in messages]
     cells = frames["data"]
     data = b"".join(bytes(m.data).ljust(cells.shape[1], b"\0") for _, m in messages)
     frames["data"] = np.frombuffer(data, dtype=np.uint8).reshape(cells.shape)

@@ -295,15 +295,26 @@ def open_exclusively(path: str, baud: int, *, write: bool = False) -> int:
     return fileno
 
 
-def make_raw(fileno: int, baud: int) -> None:
-    """Set a terminal device raw, 8N1 at ``baud`` [bit/s]."""
+def make_raw(fileno: int, baud: int, more: int = 0) -> None:
+    """Set a terminal device raw, 8N1 at ``baud`` [bit/s], with ``more`` control flags."""
     speed = getattr(termios, f"B{baud}")
     characters = termios.tcgetattr(fileno)[6]
+    # An empty read means that it hung up.
     characters[termios.VMIN], characters[termios.VTIME] = 1, 0
-    flags = termios.CS8 | termios.CREAD | termios.CLOCAL
+    flags = termios.CS8 | termios.CREAD | termios.CLOCAL | more
     termios.tcsetattr(
         fileno, termios.TCSANOW, [termios.IGNBRK, 0, flags, 0, speed, speed, characters]
     )
+
+
+def check_device(source: str, path: str) -> None:
+    """Refuse a path of something else than a device.
+
+    Raises:
+        SourceError: If it is one.
+    """
+    if Path(path).exists() and not stat.S_ISCHR(Path(path).stat().st_mode):
+        raise SourceError(source, f"{path} is no serial device")
 
 
 def bauds() -> list[int]:
@@ -337,8 +348,7 @@ def open_serial(address: SourceAddress) -> SerialSource:
     only(address, ("protocol", "baud", "tap"))
     protocol, baud = line_settings(address)
     path = address.rest
-    if Path(path).exists() and not stat.S_ISCHR(Path(path).stat().st_mode):
-        raise SourceError(address.text, f"{path} is no serial device")
+    check_device(address.text, path)
     tap = address.options.get("tap")
 
     def open_link(tally: Tally) -> DrainedLink | TapLink:

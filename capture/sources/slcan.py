@@ -19,23 +19,14 @@ import fcntl
 import os
 import re
 import select
-import stat
 import termios
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 from ..common.errors import SourceError, UsageError
-from ..log.messages.frames import (
-    EXTENDED_FLAG,
-    FD_BRS,
-    FRAME_DTYPE,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_fd_frames,
-)
+from ..log.messages import frames as wire
+from ..log.messages.frames import FrameArray, empty_fd_frames
 from ..robot.model import ClockDomain
 from .contract import (
     SourceAddress,
@@ -50,6 +41,7 @@ from .contract import (
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
+from .serial_port import bauds, check_device, make_raw
 
 STAMP_PERIOD_MS = 60_000
 """An adapter's time stamps start again after so many milliseconds."""
@@ -100,7 +92,7 @@ class SlcanText:
         tally.malformed("malformed line", len(found) - len(packed))
         if not self._has_fd:  # the usual case: nothing to pick
             return records(packed), empty_fd_frames(0)
-        size = FRAME_DTYPE.itemsize
+        size = wire.FRAME_DTYPE.itemsize
         fd = [record for record in packed if len(record) != size]
         return records(record for record in packed if len(record) == size), fd_records(fd)
 
@@ -111,13 +103,13 @@ class SlcanText:
         length = _FD_LENGTHS[int(digit, 16)]
         digits = 2 * length
         if kind in "TRxDB":
-            if flags > ID_MASK:
+            if flags > wire.ID_MASK:
                 return None
-            flags |= EXTENDED_FLAG
+            flags |= wire.EXTENDED_FLAG
         elif flags > _HIGHEST_STANDARD:
             return None
         if kind in "rR":
-            flags |= REMOTE_FLAG
+            flags |= wire.REMOTE_FLAG
             digits = 0
         if (len(rest) - digits) not in (0, 4):
             return None
@@ -129,7 +121,7 @@ class SlcanText:
         data = bytes.fromhex(rest[:digits])
         if kind in "dDbB":
             self._has_fd = True
-            brs = FD_BRS if kind in "bB" else 0
+            brs = wire.FD_BRS if kind in "bB" else 0
             return pack_fd_record(device_ns, t_ns, flags, length, 0, brs, data)
         return pack_record(device_ns, t_ns, flags, length, 0, data)
 
@@ -182,19 +174,8 @@ def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
     return found
 
 
-BITRATES = {
-    10_000: b"S0",
-    20_000: b"S1",
-    50_000: b"S2",
-    100_000: b"S3",
-    125_000: b"S4",
-    250_000: b"S5",
-    500_000: b"S6",
-    750_000: b"S7",
-    800_000: b"S7",
-    1_000_000: b"S8",
-    83_300: b"S9",
-}
+_IN_ORDER = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+BITRATES = {rate: b"S%d" % k for k, rate in enumerate(_IN_ORDER)} | {750_000: b"S7", 83_300: b"S9"}
 """Bit rate [bit/s] to the command that sets it (S7 is 800,000 with some adapters)."""
 
 _CHUNK = 65536
@@ -285,7 +266,8 @@ def open_slcan(path: str, settings: SlcanSettings, tally: Tally) -> SlcanLink:
     """
     fileno = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _make_raw(fileno, settings)
+        make_raw(fileno, settings.tty_baud, termios.CRTSCTS if settings.rtscts else 0)
+        termios.tcflush(fileno, termios.TCIOFLUSH)
         fcntl.ioctl(fileno, termios.TIOCEXCL)  # a second reader would take half of the bytes
         _write(fileno, b"\r\r\rC\r")  # whatever it was in the middle of
         _settle(fileno)
@@ -333,11 +315,9 @@ def slcan_source(address: SourceAddress, path: str) -> LinkedSource:
     if settings.bitrate is not None:
         _check_option(address, "bitrate", settings.bitrate, sorted(BITRATES))
         facts["bitrate"] = str(settings.bitrate)
-    _check_option(address, "tty_baud", settings.tty_baud, _speeds())
+    _check_option(address, "tty_baud", settings.tty_baud, bauds())
     facts["timestamps"] = "adapter, 1 ms" if settings.timestamps else "host"
-    device = Path(path)
-    if device.exists() and not stat.S_ISCHR(device.stat().st_mode):
-        raise SourceError(address.text, f"{path} is no serial device")
+    check_device(address.text, path)
     return LinkedSource(
         address,
         lambda tally: DrainedLink(open_slcan(path, settings, tally), tally, pause_s=_PAUSE_S),
@@ -351,26 +331,6 @@ def _check_option(address: SourceAddress, key: str, value: int, valid: list[int]
     if value not in valid:
         listed = ", ".join(map(str, valid))
         raise UsageError(f"{address.text!r}: {key} {value} is not one of {listed}")
-
-
-def _speeds() -> list[int]:
-    names = [name[1:] for name in dir(termios) if name.startswith("B") and name[1:].isdigit()]
-    return sorted(int(name) for name in names if name != "0")
-
-
-def _make_raw(fileno: int, settings: SlcanSettings) -> None:
-    attributes = termios.tcgetattr(fileno)
-    flags = termios.CS8 | termios.CREAD | termios.CLOCAL
-    if settings.rtscts:
-        flags |= termios.CRTSCTS
-    speed = getattr(termios, f"B{settings.tty_baud}")
-    characters = attributes[6]
-    characters[termios.VMIN] = 1  # so that an empty read means that it hung up
-    characters[termios.VTIME] = 0
-    termios.tcsetattr(
-        fileno, termios.TCSANOW, [termios.IGNBRK, 0, flags, 0, speed, speed, characters]
-    )
-    termios.tcflush(fileno, termios.TCIOFLUSH)
 
 
 def _write(fileno: int, data: bytes) -> None:

@@ -25,12 +25,11 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
 from ..common.errors import DataError, SourceError, UsageError
-from ..common.files import listen_at
+from ..common.files import Closing, listen_at
 from ..common.process import share_priority
 from ..log.messages.frames import FRAME_DTYPE, FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
@@ -353,7 +352,7 @@ def _clear(text: str, path: Path) -> None:
 _BUFFER_BYTES = 4 << 20
 
 
-class FrameSender:
+class FrameSender(Closing):
     """Sends frames to a recorder that may start later, be slow, and restart.
 
     Frames that are not accepted are not kept; their count is reported to the recorder.
@@ -413,14 +412,6 @@ class FrameSender:
         if self._socket is not None and self._dropped:
             self._put(self._socket, b"")
         self._disconnect()
-
-    def __enter__(self) -> Self:
-        """Return the sender; its first :meth:`send` connects."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Disconnect."""
-        self.close()
 
     def _put(self, sock: socket.socket, records: bytes) -> bool:
         """Send one packet; return False if there is no room or no recorder."""

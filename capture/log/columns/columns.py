@@ -8,7 +8,7 @@ layouts as servos; many different layouts are read correctly, but slower.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import BODY_AT, FIXED_SIZE, MESSAGE, PREFIX_SIZE, Buffer, Places
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_LISTS, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
@@ -136,34 +136,6 @@ def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
     """Return the expected number of messages in a number of blocks."""
     counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
     return int(counted * min(blocks / max(len(log_file.blocks), 1), 1.0)) + 1
-
-
-def message_blocks(
-    log_file: LogFile,
-    channel_ids: Sequence[int],
-    window_ns: Window,
-    warn: Callable[[str], None],
-) -> Iterator[tuple[Buffer, IntArray]]:
-    """Yield the payloads that hold messages of one topic, with the offsets of their records.
-
-    Args:
-        channel_ids: The topic's channels.
-        window_ns: Blocks wholly outside this window of log times are skipped.
-        warn: Called with one sentence for each unreadable block.
-
-    Yields:
-        Payload, valid until the next iteration, and checked record offsets, shape (n,).
-    """
-    for block in blocks_in(log_file, window_ns):  # one by one, since often only the first is used
-        for data, (records,) in record_batches(log_file, [channel_ids], [block], warn):
-            if len(records.offsets):
-                yield data, records.offsets
-
-
-def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
-    """Return the log time [Unix ns] and the bytes of the message of a record."""
-    _, length, _, _, log_ns, _ = MESSAGE.unpack_from(data, offset)
-    return log_ns, bytes(data[offset + BODY_AT : offset + PREFIX_SIZE + length])
 
 
 class _GroupReader:

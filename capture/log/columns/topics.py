@@ -15,11 +15,11 @@ from mcap.records import Schema
 
 from ...common.errors import DataError, MissingChannelError
 from ..file.log_file import LogFile
-from ..mcap.chunk import LAST_NS
+from ..mcap.chunk import BODY_AT, LAST_NS, MESSAGE, PREFIX_SIZE
 from ..messages.cdr import Layout
 from ..messages.definitions import MessageType, parse_message_type
-from .blocks import Window
-from .columns import Messages, Request, message_blocks, message_bytes, read_messages
+from .blocks import Window, blocks_in, record_batches
+from .columns import Messages, Request, read_messages
 
 _ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
 
@@ -180,14 +180,16 @@ class Topics:
         """
         ids = self._channel_ids(topic)
         start_ns, stop_ns = window_ns
-        for data, offsets in message_blocks(self._file, ids, window_ns, self._warn):
-            for offset in offsets.tolist():
-                log_ns, message = message_bytes(data, offset)
-                log_ns = min(log_ns, LAST_NS)
-                if (start_ns is None or log_ns >= start_ns) and (
-                    stop_ns is None or log_ns < stop_ns
-                ):
-                    yield log_ns, message
+        # block by block, since often only the first is used
+        for block in blocks_in(self._file, window_ns):
+            for data, (records,) in record_batches(self._file, [ids], [block], self._warn):
+                for at in records.offsets.tolist():
+                    _, length, _, _, log_ns, _ = MESSAGE.unpack_from(data, at)
+                    log_ns = min(log_ns, LAST_NS)
+                    if (start_ns is None or log_ns >= start_ns) and (
+                        stop_ns is None or log_ns < stop_ns
+                    ):
+                        yield log_ns, bytes(data[at + BODY_AT : at + PREFIX_SIZE + length])
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
         """Return the general decoder of a topic, for messages of any shape.

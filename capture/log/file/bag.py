@@ -217,20 +217,18 @@ class BagCopy:
                     copy.rosbag2(Path(self._folder.name, "part"), Allowance(path, size))
                 copy.finish()
             self.content = content_id_of(copy.files)
-        except (MemoryError, UndulogError):
+        except BaseException as error:
             self.close()
-            raise
-        except Exception as error:  # rosbags lets errors of struct, bz2 and dictionaries through
-            self.close()
+            known = isinstance(error, MemoryError | UndulogError)
+            if known or not isinstance(error, Exception):
+                raise
+            # rosbags lets errors of struct, bz2 and dictionaries through
             if isinstance(error, OSError) and error.errno in _FULL:
                 why = f"its copy fills {scratch}; choose a larger disk (TMPDIR)"
                 raise LogError(path, why) from error
             why = " ".join(str(error).split()) or type(error).__name__
             kind, fix = _WHAT[ros1]
             raise NotALogError(path, f"can't be read as {kind}: {why}; {fix}") from error
-        except BaseException:
-            self.close()
-            raise
         of = " of ROS 1" if ros1 else ""
         self.warnings = [
             *copy.warnings,

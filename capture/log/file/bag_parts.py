@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import zstandard
 from mcap.opcode import Opcode
@@ -110,11 +110,15 @@ def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Genera
 
 def _decompress(path: Path, target: Path, allowance: Allowance) -> None:
     with path.open("rb") as stream, target.open("wb") as out:
-        source = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
-        with cast("io.RawIOBase", source) as reader:
-            while piece := reader.read(_PIECE * 16):
-                allowance.take(len(piece))
-                out.write(piece)
+        out.writelines(_pieces(stream, allowance, 16 * _PIECE))
+
+
+def _pieces(packed: BinaryIO | bytes, allowance: Allowance, size: int) -> Iterator[bytes]:
+    source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+    with cast("io.RawIOBase", source) as reader:
+        while piece := reader.read(size):
+            allowance.take(len(piece))
+            yield piece
 
 
 def _of_messages(part: Part, allowance: Allowance) -> Part:
@@ -131,17 +135,11 @@ def _expanded(data: bytes, allowance: Allowance) -> bytes | None:
     Raises:
         NotALogError: If it expands too far.
     """
-    pieces: list[bytes] = []
     try:
         stated = zstandard.get_frame_parameters(data).content_size
-        source = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
-        with cast("io.RawIOBase", source) as reader:
-            while piece := reader.read(_PIECE):
-                allowance.take(len(piece))
-                pieces.append(piece)
+        whole = b"".join(_pieces(data, allowance, _PIECE))
     except zstandard.ZstdError:
         return None
-    whole = b"".join(pieces)
     unknown = stated == zstandard.CONTENTSIZE_UNKNOWN
     return whole if unknown or len(whole) >= stated else None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -51,6 +51,15 @@ def content_id_of(paths: Sequence[Path]) -> str:
             stack.callback(os.close, own)
             files.append((os.fstat(own).st_size, partial(_read, own)))
         return content_id(files)
+
+
+def sha256_of(paths: Iterable[Path]) -> str:
+    """Return the SHA-256 of the contents of files, one after the other."""
+    total = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: total)
+    return total.hexdigest()
 
 
 def session_label(session_id: str, path: Path | str) -> str:

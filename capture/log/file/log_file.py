@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from ...common.errors import LogError, NotALogError
 from ...common.remote import as_path
 from ..mcap.chunk import LAST_NS, Block, read_message_heads
-from ..mcap.file import McapFile
+from ..mcap.file import Contents, McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
 from .bag import BagCopy, is_bag
-from .content import content_id
+from .content import content_id, sha256_of
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -166,7 +166,7 @@ class Recovered:
         )
 
 
-class LogFile:
+class LogFile(Contents):
     """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
     def __init__(
@@ -189,16 +189,8 @@ class LogFile:
             LogError: If the operating system can't open it, or a folder holds several sessions.
             InputFileError: If it is a URL that can't be read.
         """
+        super().__init__()
         self.path = path = as_path(path)
-        self.warnings: list[str] = []
-        self.profile = self.library = ""
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.blocks: list[Block] = []
-        self.counts: dict[int, int] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, Attachment] = {}
-        self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
         self.foreign_wal = ""  # warning of a write-ahead log of another session
         self._sources: list[McapFile | WalTail] = []
@@ -299,14 +291,7 @@ class LogFile:
         tags = [file.remote.tag for file in self.files if file.remote is not None]
         if tags:
             return f"etag {' '.join(tags)}"
-        from hashlib import sha256
-
-        digest = sha256()
-        for file in self.files:
-            with file.path.open("rb") as stream:
-                while piece := stream.read(1 << 20):
-                    digest.update(piece)
-        return digest.hexdigest()
+        return sha256_of(file.path for file in self.files)
 
     def source_of(self, block: Block) -> McapFile | WalTail:
         """Return the file, or the part of the write-ahead log, that holds a block."""
@@ -343,11 +328,7 @@ class LogFile:
         """Add a metadata record or attachment once; each part repeats those of the session."""
         if item.name == PART_RECORD or (len(self._sources) and item in self.appendices):
             return
-        self.appendices.append(item)
-        if isinstance(item, Attachment):
-            self.attachments[item.name] = item
-        else:
-            self.metadata.setdefault(item.name, {}).update(item.metadata)
+        self.append(item)
 
     def _leave_foreign(self, wal: WalContents) -> None:
         """Warn of a write-ahead log of another session, left by a copy."""

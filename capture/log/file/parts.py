@@ -18,6 +18,7 @@ from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
 from .bag_metadata import METADATA, is_rosbag2
+from .content import sha256_of
 
 PART_RECORD = "undulog.part"
 """Metadata record of a part: ``part`` (its number), ``previous`` and ``previous_sha256`` (file
@@ -58,12 +59,8 @@ def later_parts(first: Path) -> list[Path]:
     Raises:
         OSError: If the folder can't be listed.
     """
-    found: list[tuple[int, Path]] = []
-    for path in first.parent.iterdir():
-        head, number = split_part_path(path)
-        if number > 1 and head == first:
-            found.append((number, path))
-    return [path for _, path in sorted(found)]
+    names = [(*split_part_path(path), path) for path in first.parent.iterdir()]
+    return [path for head, number, path in sorted(names) if number > 1 and head == first]
 
 
 _MOST_LISTED = 20
@@ -135,24 +132,18 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
     return found
 
 
-def check_chain(parts: PartFiles) -> list[str]:
-    """Compare each part with its hash in the next one; return the faults, one sentence each."""
-    from hashlib import file_digest
-
-    wrong: list[str] = []
+def check_chain(parts: PartFiles) -> Iterator[str]:
+    """Compare each part with its hash in the next one; yield the faults, one sentence each."""
     for number, file in parts.files.items():
         stated = _part_record(file).get("previous_sha256")
         former = parts.files.get(number - 1)
         if stated is None or former is None:
             continue
-        with former.path.open("rb") as stream:
-            found = file_digest(stream, "sha256").hexdigest()
-        if found != stated:
-            wrong.append(
+        if sha256_of([former.path]) != stated:
+            yield (
                 f"{former.path.name} is not the file that {file.path.name} was recorded after: "
                 "its hash is another"
             )
-    return wrong
 
 
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
@@ -253,12 +244,11 @@ def _redefines(file: McapFile, others: list[McapFile]) -> bool:
 
 
 def _kinds(file: McapFile) -> list[tuple[int, tuple[str, str, bytes]]]:
-    kinds: list[tuple[int, tuple[str, str, bytes]]] = []
-    for key, channel in file.channels.items():
-        schema = file.schemas.get(channel.schema_id)
-        kind = (channel.topic, schema.name, schema.data) if schema else (channel.topic, "", b"")
-        kinds.append((key, kind))
-    return kinds
+    types = {key: (schema.name, schema.data) for key, schema in file.schemas.items()}
+    return [
+        (key, (channel.topic, *types.get(channel.schema_id, ("", b""))))
+        for key, channel in file.channels.items()
+    ]
 
 
 def _part_record(file: McapFile) -> dict[str, str]:

@@ -8,7 +8,7 @@ message, minus the first if the file doesn't begin with the recording (a cut, a 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -243,11 +243,11 @@ class SourceHealth:
 
     name: str
     frames: int
-    dropped: int | None
-    malformed: int
-    error_frames: int
-    reconnects: int
-    clock_resets: int
+    dropped: int | None = None
+    malformed: int = 0
+    error_frames: int = 0
+    reconnects: int = 0
+    clock_resets: int = 0
 
 
 def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, ...]:
@@ -301,46 +301,29 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
             for key in _COUNTS
             if key in status.values
         }
-        found.append(
-            SourceHealth(
-                name=status.name.removeprefix(SOURCE_PREFIX),
-                frames=counts["frames"],
-                dropped=counts.get("dropped"),
-                malformed=counts.get("malformed", 0),
-                error_frames=counts.get("error_frames", 0),
-                reconnects=counts.get("reconnects", 0),
-                clock_resets=counts.get("clock_resets", 0),
-            )
-        )
+        found.append(SourceHealth(status.name.removeprefix(SOURCE_PREFIX), **counts))
     return tuple(sorted(found, key=lambda source: source.name))
 
 
-def judge_source(source: SourceHealth) -> list[Finding]:
-    """Return findings on one source."""
-    found: list[Finding] = []
+def judge_source(source: SourceHealth) -> Iterator[Finding]:
+    """Yield findings on one source."""
     label = f"source {source.name}"
     if not source.frames:
-        return [Finding(1, f"{label} gave nothing")]
+        yield Finding(1, f"{label} gave nothing")
+        return
     if source.dropped:
         expected = source.frames + source.dropped
         part = source.dropped / expected
-        found.append(
-            Finding(
-                2 if part >= BAD_LOSS else 1,
-                f"{label} lost {source.dropped} of {expected} frames before the recorder "
-                f"({100 * part:.2g}%)",
-            )
-        )
+        lost = f"{label} lost {source.dropped} of {expected} frames before the recorder"
+        yield Finding(2 if part >= BAD_LOSS else 1, f"{lost} ({100 * part:.2g}%)")
     if source.malformed:
         weight = int(source.malformed > GOOD_LOSS * source.frames)
-        sentence = f"{label} sent {source.malformed} packets that can't be read"
-        found.append(Finding(weight, sentence))
+        yield Finding(weight, f"{label} sent {source.malformed} packets that can't be read")
     if source.reconnects:
-        found.append(Finding(0, f"{label} was connected again {_times(source.reconnects)}"))
+        yield Finding(0, f"{label} was connected again {_times(source.reconnects)}")
     if source.clock_resets:
-        sentence = f"the clock of {label} was set or restarted {_times(source.clock_resets)}"
-        found.append(Finding(0, sentence))
-    return found
+        times = _times(source.clock_resets)
+        yield Finding(0, f"the clock of {label} was set or restarted {times}")
 
 
 def _times(count: int) -> str:

@@ -26,17 +26,10 @@ from ..columns.layouts import (
     values_of,
 )
 from ..mcap.chunk import BODY_AT, FIXED_SIZE, LAST_NS, Buffer, gather
+from ..messages import frames as wire
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import MessageType
-from ..messages.frames import (
-    FD_FRAME_DTYPE,
-    FD_FRAME_LAYOUT,
-    FD_TOPIC_PREFIX,
-    FRAME_DTYPE,
-    FRAME_LAYOUT,
-    FRAME_TOPIC_PREFIXES,
-    records_at,
-)
+from ..messages.frames import records_at
 from .bus_tally import BusTally
 from .freeze import RangeTally
 from .rules import LIMIT_RAD
@@ -126,7 +119,7 @@ class ChannelScan:
         self.sequence = SequenceTally()
         self.series: dict[tuple[str, ...], Series] = {}
         framed = kind is not None and kind.name == "std_msgs/msg/UInt8MultiArray"
-        framed = framed and topic.startswith(FRAME_TOPIC_PREFIXES)
+        framed = framed and topic.startswith(wire.FRAME_TOPIC_PREFIXES)
         self.bus = BusTally(horizon_s) if framed else None
         self.ends: tuple[bytes, bytes] | None = None
         self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
@@ -282,8 +275,12 @@ class ChannelScan:
         whole: list[tuple[IntArray, Matrix]],
         count: int,
     ) -> None:
-        fd = self.topic.startswith(FD_TOPIC_PREFIX)
-        dtype, label = (FD_FRAME_DTYPE, FD_FRAME_LAYOUT) if fd else (FRAME_DTYPE, FRAME_LAYOUT)
+        fd = self.topic.startswith(wire.FD_TOPIC_PREFIX)
+        dtype, label = (
+            (wire.FD_FRAME_DTYPE, wire.FD_FRAME_LAYOUT)
+            if fd
+            else (wire.FRAME_DTYPE, wire.FRAME_LAYOUT)
+        )
         sizes = np.zeros(count, np.int64)
         found: list[tuple[IntArray, Matrix]] = []
         for rows, matrix in whole:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,13 +23,13 @@ from ...common.remote import as_path
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
-from ..messages.definitions import CONTRACT_VERSION, is_of_contract
-from ..messages.frames import (
-    FD_FRAME_DTYPE,
-    FD_FRAME_LAYOUT,
-    FRAME_DTYPE,
-    FRAME_LAYOUT,
-    FRAME_TOPIC_PREFIXES,
+from ..messages import frames as wire
+from ..messages.definitions import (
+    CONTRACT_VERSION,
+    JOINT_STATE,
+    VERDICTS,
+    PowerTopic,
+    is_of_contract,
 )
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
@@ -56,9 +56,7 @@ RULES: Mapping[str, str] = MappingProxyType(
 )
 """Name of each rule to what it asks for."""
 
-_JOINT_STATE = "sensor_msgs/msg/JointState"
-_BYTES = "std_msgs/msg/UInt8MultiArray"
-_FRAME_PREFIXES = (*FRAME_TOPIC_PREFIXES, "/serial/")
+_FRAME_PREFIXES = (*wire.FRAME_TOPIC_PREFIXES, wire.SERIAL_TOPIC_PREFIX)
 _UNITS = {
     "/joint_commands": "rad",
     "/joint_states": "rad",
@@ -69,14 +67,11 @@ _UNITS = {
     "/joint_current": "A",
     "/joint_voltage": "V",
     "/joint_temperature": "degC",
-    "/joint_power/mechanical": "W",
-    "/joint_power/mechanical_plus": "W",
-    "/joint_power/electrical": "W",
-    "/joint_power/electrical_plus": "W",
+    **dict.fromkeys(PowerTopic, "W"),
     "/gate/wanted": "rad",
     "/energy_ledger": "J",
 }
-_TYPES = dict.fromkeys([*_UNITS, "/gait"], _JOINT_STATE) | {
+_TYPES = dict.fromkeys([*_UNITS, "/gait"], JOINT_STATE) | {
     "/sonar": "sensor_msgs/msg/Range",
     "/imu": "sensor_msgs/msg/Imu",
     "/compass": "sensor_msgs/msg/MagneticField",
@@ -91,14 +86,13 @@ _TYPES = dict.fromkeys([*_UNITS, "/gait"], _JOINT_STATE) | {
 _TYPES_BELOW = {
     "/ir/": "sensor_msgs/msg/Range",
     "/clock/": "sensor_msgs/msg/TimeReference",
-    **dict.fromkeys(_FRAME_PREFIXES, _BYTES),
+    **dict.fromkeys(_FRAME_PREFIXES, wire.FRAMES_TYPE),
 }
 _OTHER_NAMES = {"/gait", "/energy_ledger"}
 """JointStates whose names are no joints."""
 
 _REQUIRED = ("session_id", "contract", "epoch_ns", "robot")
 _CLOCKS = ("host", "device", "simulated")
-_VERDICTS = ("good", "degraded", "bad")
 _YEAR_2000_NS = 946_684_800 * 10**9
 _DAY_NS = 86_400 * 10**9
 _MOST_LISTED = 3
@@ -138,7 +132,7 @@ def check_contract(path: Path | str) -> tuple[Violation, ...]:
     log = OpenLog(as_path(path), None, threads_or_default(None))
     try:
         order = list(RULES)
-        found = (one for check in _CHECKS for one in check(log))
+        found = chain(_container(log), _topics(log), _record(log), _health(log), _robot(log))
         return tuple(sorted(found, key=lambda one: order.index(one.rule)))
     finally:
         log.file.close()
@@ -187,7 +181,7 @@ def _shared_chunks(file: McapFile, name: str) -> Iterator[Violation]:
 
 def _is_joint(file: McapFile, key: int) -> bool:
     schema = file.schemas.get(file.channels[key].schema_id)
-    return schema is not None and schema.name == _JOINT_STATE
+    return schema is not None and schema.name == JOINT_STATE
 
 
 def _record_first(file: McapFile, name: str) -> Iterator[Violation]:
@@ -235,7 +229,7 @@ def _topic(view: SessionView, topic: str, channel: Channel) -> Iterator[Violatio
         yield Violation("unit", f"{topic}: channel metadata unit", found, f"{_UNITS[topic]!r}")
     for log_ns, message in islice(view.messages(topic), 1):
         yield from _stamp(topic, log_ns, message)
-        if channel.type_name == _JOINT_STATE:
+        if channel.type_name == JOINT_STATE:
             yield from _lengths(topic, message)
         if topic.startswith(_FRAME_PREFIXES):
             yield from _frames(topic, message)
@@ -294,9 +288,10 @@ def _names(view: SessionView, topic: str) -> Iterator[Violation]:
 
 def _frames(topic: str, message: Any) -> Iterator[Violation]:
     fd = not topic.startswith("/can/")
-    layout, size = (
-        (FD_FRAME_LAYOUT, FD_FRAME_DTYPE.itemsize) if fd else (FRAME_LAYOUT, FRAME_DTYPE.itemsize)
+    layout, dtype = (
+        (wire.FD_FRAME_LAYOUT, wire.FD_FRAME_DTYPE) if fd else (wire.FRAME_LAYOUT, wire.FRAME_DTYPE)
     )
+    size = dtype.itemsize
     dims = [(one.label, one.size) for one in message.layout.dim]
     count = len(message.data) // size
     if dims != [("frame", count), (layout, size)] or len(message.data) != count * size:
@@ -334,8 +329,8 @@ def _health(log: OpenLog) -> Iterator[Violation]:
     record = log.file.metadata.get("undulog.health")
     if record is None:
         return
-    if record.get("verdict") not in _VERDICTS:
-        found, fix = repr(record.get("verdict")), f"write one of {', '.join(_VERDICTS)}"
+    if record.get("verdict") not in VERDICTS:
+        found, fix = repr(record.get("verdict")), f"write one of {', '.join(VERDICTS)}"
         yield Violation("health", "record undulog.health: verdict", found, fix)
     try:
         is_list = isinstance(json.loads(record.get("reasons", "[]")), list)
@@ -363,12 +358,3 @@ def _robot(log: OpenLog) -> Iterator[Violation]:
 
 def _listed(names: Sequence[str]) -> str:
     return some_names(names, _MOST_LISTED)
-
-
-_CHECKS: tuple[Callable[[OpenLog], Iterator[Violation]], ...] = (
-    _container,
-    _topics,
-    _record,
-    _health,
-    _robot,
-)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -20,19 +19,18 @@ KEPT_S = 600
 """Most seconds that a live tally keeps for another series whose stamps lag behind."""
 
 
-@dataclass(frozen=True)
-class Ranges:
+class Ranges(NamedTuple):
     """Smallest and largest value of each joint in each second.
 
     Attributes:
         second: Unix seconds, increasing, shape (s,).
-        count: Samples in each, shape (s,).
+        samples: Samples in each, shape (s,).
         low: Shape (s, k); NaN for a second without other values.
         high: Shape (s, k).
     """
 
     second: IntArray
-    count: IntArray
+    samples: IntArray
     low: FloatArray
     high: FloatArray
 
@@ -82,14 +80,7 @@ class RangeTally:
             none = np.empty((0, width))
             return Ranges(np.empty(0, np.int64), np.empty(0, np.int64), none, none)
         if len(self._parts) > 1:
-            self._parts = [
-                _by_second(
-                    np.concatenate([part.second for part in self._parts]),
-                    np.concatenate([part.count for part in self._parts]),
-                    np.concatenate([part.low for part in self._parts]),
-                    np.concatenate([part.high for part in self._parts]),
-                )
-            ]
+            self._parts = [_by_second(*map(np.concatenate, zip(*self._parts, strict=True)))]
         return self._parts[0]
 
     @property
@@ -112,9 +103,7 @@ class RangeTally:
         whole = self.result(self._parts[0].low.shape[1])
         kept = whole.second >= first
         if not kept.all():
-            self._parts = [
-                Ranges(whole.second[kept], whole.count[kept], whole.low[kept], whole.high[kept])
-            ]
+            self._parts = [Ranges._make(column[kept] for column in whole)]
 
 
 def _by_second(second: IntArray, count: IntArray, low: FloatArray, high: FloatArray) -> Ranges:
@@ -140,7 +129,7 @@ class FreezeTally:
         """Indices in ``names`` of the joints of both, m of them."""
         self._measured = list(self.columns)
         self._commanded = [place[names[k]] for k in self.columns]
-        self._runs = _Runs(len(self.columns))
+        self._runs = _Runs(-(2**62), *np.zeros((3, len(self.columns)), np.int64))
 
     def result(
         self, measured: Ranges, command: Ranges, closed: int | None
@@ -164,7 +153,7 @@ class FreezeTally:
         seconds, here, there = cast("tuple[IntArray, IntArray, IntArray]", found)
         stood = measured.high[here][:, self._measured]
         stood = stood == measured.low[here][:, self._measured]
-        stood &= (measured.count[here] >= FROZEN_SAMPLES)[:, None]
+        stood &= (measured.samples[here] >= FROZEN_SAMPLES)[:, None]
         span = command.high[there][:, self._commanded]
         span = span - command.low[there][:, self._commanded]
         frozen = stood & (span > FROZEN_COMMAND_RAD)
@@ -176,22 +165,19 @@ class FreezeTally:
         return ahead.longest, ahead.longest_at
 
 
-class _Runs:
+class _Runs(NamedTuple):
     """Runs of flagged, consecutive seconds: the current and the longest one."""
 
-    def __init__(self, width: int) -> None:
-        self.second = -(2**62)
-        self.run = np.zeros(width, np.int64)
-        self.longest = np.zeros(width, np.int64)
-        self.longest_at = np.zeros(width, np.int64)
+    second: int
+    run: IntArray
+    longest: IntArray
+    longest_at: IntArray
 
     def after(self, seconds: IntArray, flags: BoolArray) -> _Runs:
         """Return the runs with more seconds, shape (s,), and flags, shape (s, m)."""
         if not len(seconds):
             return self
-        runs = _Runs(len(self.run))
-        before, run = self.second, self.run
-        longest, longest_at = self.longest.copy(), self.longest_at.copy()
+        before, run, longest, longest_at = self
         quiet = not run.any()
         some: list[bool] = np.asarray(flags.any(axis=1)).tolist()
         numbers: list[int] = seconds.tolist()
@@ -203,5 +189,4 @@ class _Runs:
                 longest_at = np.where(more, second + 1 - run, longest_at)
                 quiet = not some[k]
             before = second
-        runs.second, runs.run, runs.longest, runs.longest_at = before, run, longest, longest_at
-        return runs
+        return _Runs(before, run, longest, longest_at)

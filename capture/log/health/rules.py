@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
+from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from ..read.facts import TIMES_FROM_FPS
 from ..read.joint_messages import JOINT_TYPES
@@ -62,7 +63,6 @@ BAD_JOINTS = 0.5
 
 _MOST_LISTED = 8
 
-VERDICTS = ("good", "degraded", "bad")
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
@@ -157,13 +157,10 @@ def _where(group: Sequence[Fault]) -> str:
     topics: dict[tuple[str, ...], list[str]] = {}
     for topic, found in names.items():
         topics.setdefault(tuple(found), []).append(topic)
-    parts: list[str] = []
-    for found, where in topics.items():
-        label = listed(where)
-        if found != ("",):
-            label += f", {listed(found)}"
-        parts.append(label)
-    return "; ".join(parts)
+    return "; ".join(
+        listed(where) + ("" if found == ("",) else f", {listed(found)}")
+        for found, where in topics.items()
+    )
 
 
 def listed(names: Sequence[str], most: int = _MOST_LISTED) -> str:
@@ -173,61 +170,45 @@ def listed(names: Sequence[str], most: int = _MOST_LISTED) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def judge_file(health: FileHealth) -> list[Finding]:
-    """Return findings on the container."""
-    found = [Finding(2, sentence) for sentence in health.damage]
+def judge_file(health: FileHealth) -> Iterator[Finding]:
+    """Yield findings on the container."""
+    yield from (Finding(2, sentence) for sentence in health.damage)
     if health.unfinished:
-        found.append(Finding(0 if health.running else 1, health.unfinished))
+        yield Finding(0 if health.running else 1, health.unfinished)
     elif health.truncated:
-        found.append(Finding(1, "the file is cut short: what came after the cut is lost"))
+        yield Finding(1, "the file is cut short: what came after the cut is lost")
     elif not health.indexed:
-        found.append(Finding(1, "the file has no usable index and can only be read from the start"))
-    found += [Finding(0, sentence) for sentence in health.notes]
+        yield Finding(1, "the file has no usable index and can only be read from the start")
+    yield from (Finding(0, sentence) for sentence in health.notes)
     if health.without_crc:
-        found.append(
-            Finding(
-                0,
-                f"{health.without_crc} of {health.chunks} chunks carry no CRC: damage in them "
-                "can't be excluded",
-            )
-        )
-    return found
+        without = f"{health.without_crc} of {health.chunks} chunks carry no CRC"
+        yield Finding(0, f"{without}: damage in them can't be excluded")
 
 
-def judge_made_times(facts: Mapping[str, str]) -> list[Finding]:
+def judge_made_times(facts: Mapping[str, str]) -> Iterator[Finding]:
     """Note that times were made from a frame rate: what their rhythm would show is not in them."""
-    if TIMES_FROM_FPS not in facts:
-        return []
-    return [
-        Finding(
+    if TIMES_FROM_FPS in facts:
+        yield Finding(
             0,
             f"times made from fps = {facts[TIMES_FROM_FPS]}: jitter, gaps and lost samples can't "
             "be told, and lags are in error by up to a frame",
         )
-    ]
 
 
-def judge_channel(health: ChannelHealth) -> list[Fault]:
-    """Return what is wrong with one channel."""
-    found: list[Fault] = []
-
-    def add(weight: int, text: str) -> None:
-        found.append(Fault(weight, health.topic, "", text))
-
-    expected = health.count + (health.sequence.dropped or 0)
+def judge_channel(health: ChannelHealth) -> Iterator[Fault]:
+    """Yield what is wrong with one channel."""
+    topic, expected = health.topic, health.count + (health.sequence.dropped or 0)
     if health.sequence.dropped:
         part = health.sequence.dropped / expected
-        add(
-            2 if part >= BAD_LOSS else 1,
-            f"{health.sequence.dropped} of {expected} messages were dropped ({part:.2%}), as its "
-            "sequence numbers prove",
-        )
+        dropped = f"{health.sequence.dropped} of {expected} messages were dropped ({part:.2%})"
+        text = f"{dropped}, as its sequence numbers prove"
+        yield Fault(2 if part >= BAD_LOSS else 1, topic, "", text)
     if health.sequence.reordered:
-        add(0, f"{health.sequence.reordered} messages are out of sequence")
+        yield Fault(0, topic, "", f"{health.sequence.reordered} messages are out of sequence")
     if health.unread:
         weight = 2 if health.unread >= BAD_LOSS * health.count else 1
-        add(weight, f"{health.unread} of {health.count} messages can't be decoded")
-    return found
+        text = f"{health.unread} of {health.count} messages can't be decoded"
+        yield Fault(weight, topic, "", text)
 
 
 def has_rhythm(topic: str) -> bool:
@@ -235,47 +216,41 @@ def has_rhythm(topic: str) -> bool:
     return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
 
 
-def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault]:
-    """Return what is wrong with the rhythm of one series.
+def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[Fault]:
+    """Yield what is wrong with the rhythm of one series.
 
     Args:
         start_ns: Log time of the session's first message [Unix ns].
         end_ns: Log time of its last message [Unix ns].
 
-    Returns:
+    Yields:
         The faults; none for view aids and for the recorder's own topics.
     """
-    timing = health.timing
+    timing, label = health.timing, health.label
     if timing.median_s is None or not has_rhythm(health.topic):
-        return []
-    found: list[Fault] = []
-
-    def add(weight: int, text: str) -> None:
-        found.append(Fault(weight, health.label, "", text))
-
+        return
     when = _at(timing.longest_at_ns, timing.first_ns)
     joints = health.type_name.endswith("/JointState")
     span_s = (timing.last_ns - timing.first_ns) / NS
     mostly_paused = joints and timing.paused_s >= BAD_PAUSE * span_s
     if timing.gaps:
-        found.append(_gaps(health, when, mostly_paused=mostly_paused))
+        yield _gaps(health, when, mostly_paused=mostly_paused)
     elif joints and timing.paused_s:
         text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
-        add(1 + mostly_paused, f"{text}{timing.longest_s:.3g} s, {when}")
+        yield Fault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
     if timing.regular:
-        for text in _edges_and_jitter(health, start_ns, end_ns):
-            add(1, text)
+        texts = _edges_and_jitter(health, start_ns, end_ns)
+        yield from (Fault(1, label, "", text) for text in texts)
     elif joints and timing.count > FROZEN_SAMPLES:
-        add(0, "no steady rate, so single gaps can't be found")
+        yield Fault(0, label, "", "no steady rate, so single gaps can't be found")
     if timing.backward:
-        add(1, f"{timing.backward} stamps go back in time")
+        yield Fault(1, label, "", f"{timing.backward} stamps go back in time")
     if timing.duplicates:
         weight = int(timing.duplicates > GOOD_LOSS * timing.count)
-        add(weight, f"{timing.duplicates} stamps are repeated")
+        yield Fault(weight, label, "", f"{timing.duplicates} stamps are repeated")
     if health.nan and not joints:
         weight = int(health.nan > GOOD_LOSS * health.numbers)
-        add(weight, f"{health.nan} of {health.numbers} numbers are not a number")
-    return found
+        yield Fault(weight, label, "", f"{health.nan} of {health.numbers} numbers are not a number")
 
 
 def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
@@ -309,30 +284,31 @@ def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Itera
         yield f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
 
 
-def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
-    """Return what is wrong with the joints, each by itself.
+def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[Fault]:
+    """Yield what is wrong with the joints, each by itself.
 
     Args:
         joints: Measures of all joints of all topics.
         start_ns: Start of the session [Unix ns].
     """
-    found: list[Fault] = []
     for joint in joints:
-        texts: list[tuple[int, str]] = []
-        if joint.nan:
-            weight = int(joint.nan > GOOD_LOSS * joint.samples)
-            texts.append((weight, f"{joint.nan} of {joint.samples} samples are not a number"))
-        if _is_frozen(joint):
-            when = _at(joint.frozen_at_ns, start_ns)
-            texts.append((1, f"frozen for {joint.frozen_s} s while its command moved, {when}"))
-        if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
-            texts.append((1, f"at the robot's limits in {joint.at_limit:.0%} of the samples"))
-        found += [Fault(weight, joint.topic, joint.name, text) for weight, text in texts]
-    return found
+        for weight, text in _joint_faults(joint, start_ns):
+            yield Fault(weight, joint.topic, joint.name, text)
 
 
-def judge_body(measured: Sequence[JointHealth]) -> list[Finding]:
-    """Return findings on all measured joints together."""
+def _joint_faults(joint: JointHealth, start_ns: int) -> Iterator[tuple[int, str]]:
+    if joint.nan:
+        weight = int(joint.nan > GOOD_LOSS * joint.samples)
+        yield weight, f"{joint.nan} of {joint.samples} samples are not a number"
+    if _is_frozen(joint):
+        when = _at(joint.frozen_at_ns, start_ns)
+        yield 1, f"frozen for {joint.frozen_s} s while its command moved, {when}"
+    if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
+        yield 1, f"at the robot's limits in {joint.at_limit:.0%} of the samples"
+
+
+def judge_body(measured: Sequence[JointHealth]) -> Iterator[Finding]:
+    """Yield findings on all measured joints together."""
     names = {joint.name for joint in measured}
     dead = {
         joint.name
@@ -340,8 +316,7 @@ def judge_body(measured: Sequence[JointHealth]) -> list[Finding]:
         if _is_frozen(joint) or joint.nan > BAD_LOSS * joint.samples
     }
     if len(names) > 1 and len(dead) >= BAD_JOINTS * len(names):
-        return [Finding(2, f"{len(dead)} of {len(names)} joints are frozen or missing")]
-    return []
+        yield Finding(2, f"{len(dead)} of {len(names)} joints are frozen or missing")
 
 
 def _is_frozen(joint: JointHealth) -> bool:
@@ -355,22 +330,20 @@ def judge_following(fault: JointFault) -> Finding:
     return Finding(1, f"{fault.joint}{when} {fault.evidence}: {' or '.join(fault.kinds)}")
 
 
-def judge_bus(health: BusHealth) -> list[Finding]:
-    """Return findings on a bus."""
-    found: list[Finding] = []
+def judge_bus(health: BusHealth) -> Iterator[Finding]:
+    """Yield findings on a bus."""
     if health.error_frames:
         part = health.error_frames / health.frames
         weight = 2 if part >= BAD_LOSS else int(part > GOOD_LOSS)
         sentence = f"{health.topic}: {health.error_frames} of {health.frames} are error frames"
-        found.append(Finding(weight, sentence))
+        yield Finding(weight, sentence)
     if health.peak_load is not None and health.peak_load[0] > MAX_BUS_LOAD:
         sentence = f"{health.topic}: {health.peak_load[0]:.0%} of the bitrate in the busiest second"
-        found.append(Finding(1, sentence))
-    return found
+        yield Finding(1, sentence)
 
 
-def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
-    """Return findings on times without any frame of a bus, classic or CAN FD.
+def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> Iterator[Finding]:
+    """Yield findings on times without any frame of a bus, classic or CAN FD.
 
     Of a bus with both kinds, the overlap of their longest silences counts.
 
@@ -383,12 +356,9 @@ def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
         begin, end = bus.longest_at_ns, bus.longest_at_ns + round(bus.longest_s * NS)
         topic, earlier, later = silences.get(bus_of(bus.topic), (bus.topic, begin, end))
         silences[bus_of(bus.topic)] = topic, max(begin, earlier), min(end, later)
-    found: list[Finding] = []
     for topic, begin, end in silences.values():
         if (silent_s := (end - begin) / NS) > PAUSE_S:
-            when = _at(begin, start_ns)
-            found.append(Finding(1, f"{topic}: silent for {silent_s:.3g} s, {when}"))
-    return found
+            yield Finding(1, f"{topic}: silent for {silent_s:.3g} s, {_at(begin, start_ns)}")
 
 
 def judge_topics(
@@ -397,8 +367,8 @@ def judge_topics(
     joints: Sequence[str],
     seen: Iterable[str],
     undecoded: str | None = None,
-) -> list[Finding]:
-    """Return findings on topics of joints that the session lacks.
+) -> Iterator[Finding]:
+    """Yield findings on topics of joints that the session lacks.
 
     Args:
         types: Topic with messages to type.
@@ -408,7 +378,8 @@ def judge_topics(
         undecoded: Why almost no raw CAN frame could be decoded, which then is the only reason for
             missing topics; None otherwise.
     """
-    found = [] if undecoded is None else [Finding(1, undecoded)]
+    if undecoded is not None:
+        yield Finding(1, undecoded)
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
     others = sorted(topic for topic, kind in types.items() if kind in JOINT_TYPES)
     commands, responses = topics
@@ -423,12 +394,11 @@ def judge_topics(
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:
             sentence = f"{topic} is missing, and no other topic has joints"
-        found.append(Finding(2 if (not others and not framed) else 1, sentence))
+        yield Finding(2 if (not others and not framed) else 1, sentence)
     present = set(seen)
     missing = [name for name in joints if name not in present]
     if present and missing:
-        found.append(Finding(1, f"{responses} never carries {', '.join(missing)}"))
-    return found
+        yield Finding(1, f"{responses} never carries {', '.join(missing)}")
 
 
 def verdict_of(findings: Iterable[Finding]) -> str:

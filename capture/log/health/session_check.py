@@ -8,7 +8,6 @@ Format: https://mcap.dev/spec.
 
 from __future__ import annotations
 
-import json
 import mmap
 import re
 import struct
@@ -16,7 +15,6 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -28,6 +26,7 @@ from ...following.find import faults_in_session
 from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
 from ..mcap.file import McapFile
+from ..messages.definitions import stated_reasons
 from ..read.joint_messages import joint_source
 from ..read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..read.open_log import OpenLog
@@ -206,7 +205,7 @@ class _Check:
             path=self._file.path,
             session_id=self._file.session_id,
             stored=stored.get("verdict"),
-            stored_reasons=_reasons(stored.get("reasons", "[]")),
+            stored_reasons=stated_reasons(stored),
             file=file,
             following=tuple(self._judge_following(file, found.reasons)),
         )
@@ -242,11 +241,10 @@ class _Check:
             done += 1
             on_part(done / total)
 
-        several = len(log_file.files) > 1
-        found = [
-            _with_name(self._read_file(part, file, step), file.path.name if several else "")
-            for part, file in enumerate(log_file.files)
-        ]
+        files = log_file.files
+        found = [self._read_file(part, file, step) for part, file in enumerate(files)]
+        prefixes = [f"{file.path.name}: " if len(files) > 1 else "" for file in files]
+        of_files = list(zip(prefixes, found, strict=True))
         for block in log_file.blocks:
             if block.part >= len(found):  # from the write-ahead log, checked when it was read
                 self._read_block(block, log_file.path)
@@ -262,11 +260,11 @@ class _Check:
             chunks=sum(one.chunks for one in found),
             checked=sum(one.checked for one in found),
             without_crc=sum(one.without_crc for one in found),
-            damage=(*(text for one in found for text in one.damage), *missing),
+            damage=(*(name + text for name, one in of_files for text in one.damage), *missing),
             truncated=any(one.truncated for one in found),
             indexed=all(one.indexed for one in found),
             notes=(
-                *(text for one in found for text in one.notes),
+                *(name + text for name, one in of_files for text in one.notes),
                 *self._notes,
                 *filter(None, [log_file.foreign_wal]),
             ),
@@ -389,25 +387,6 @@ def _unlisted(file: McapFile, chunk: Block) -> str:
     except LogError as error:
         return str(error).removeprefix(f"{file.path}: ")
     return f"the chunk at byte {chunk.start} is missing in the index"
-
-
-def _with_name(health: FileHealth, name: str) -> FileHealth:
-    """Prefix the sentences of one part with its name."""
-    if not name:
-        return health
-    return replace(
-        health,
-        damage=tuple(f"{name}: {text}" for text in health.damage),
-        notes=tuple(f"{name}: {text}" for text in health.notes),
-    )
-
-
-def _reasons(text: str) -> tuple[str, ...]:
-    try:
-        found: Any = json.loads(text)
-    except (ValueError, RecursionError):
-        return (text,)
-    return tuple(map(str, cast("list[Any]", found))) if isinstance(found, list) else (str(found),)
 
 
 def _names(sentence: str, joint: str) -> bool:

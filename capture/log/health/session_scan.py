@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...common.arrays import NS, IntArray
 from ...robot.model import Robot
 from ..mcap.chunk import Buffer
+from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
 from .bus_tally import SourceHealth, judge_source, measure_sources, named_identifiers, undecoded
@@ -37,8 +38,6 @@ from .tallies import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
 """Most pairs of measured and commanded joint sets that are checked for frozen joints."""
-
-COMMANDS, STATES = "/joint_commands", "/joint_states"
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ class SessionScan:
         robot: Robot | None,
         *,
         horizon_s: int | None = None,
-        topics: tuple[str, str] = (COMMANDS, STATES),
+        topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
     ) -> None:
         """Start without channels.
 

@@ -6,7 +6,7 @@ bounded summary, and returns a frozen result at any moment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -302,13 +302,11 @@ class JointHealth:
 
     def with_more(self, other: JointHealth) -> JointHealth:
         """Add the counts of the same joint in other messages; keep the longer freeze."""
-        samples = self.samples + other.samples
         held = [(j.at_limit, j.samples) for j in (self, other) if j.at_limit is not None]
         frozen = max(self, other, key=lambda joint: joint.frozen_s or 0)
-        return JointHealth(
-            topic=self.topic,
-            name=self.name,
-            samples=samples,
+        return replace(
+            self,
+            samples=self.samples + other.samples,
             nan=self.nan + other.nan,
             at_limit=sum(part * n for part, n in held) / sum(n for _, n in held) if held else None,
             frozen_s=frozen.frozen_s,

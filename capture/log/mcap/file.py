@@ -277,8 +277,8 @@ _INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, chan
 _NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
 
 
-class McapFile(McapPayloads):
-    """An MCAP file as blocks, channels, schemas, metadata and attachments.
+class Contents:
+    """Blocks, channels, schemas, metadata and attachments of one MCAP file or several.
 
     Attributes:
         profile: As stated in the header, like ``library``.
@@ -287,6 +287,33 @@ class McapFile(McapPayloads):
         attachments: By name; of several the last.
         appendices: Both, as stored; names may repeat.
         warnings: Parts that could not be read, one sentence each.
+    """
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self.profile = self.library = ""
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.blocks: list[Block] = []
+        self.counts: dict[int, int] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, Attachment] = {}
+        self.appendices: list[Attachment | Metadata] = []
+        self.warnings: list[str] = []
+
+    def append(self, item: Attachment | Metadata) -> None:
+        """Add an attachment or a metadata record."""
+        self.appendices.append(item)
+        if isinstance(item, Attachment):
+            self.attachments[item.name] = item
+        else:
+            self.metadata.setdefault(item.name, {}).update(item.metadata)
+
+
+class McapFile(Contents, McapPayloads):
+    """The contents of an MCAP file.
+
+    Attributes:
         cut: Why the file was read record by record; empty if the summary was enough.
     """
 
@@ -300,16 +327,9 @@ class McapFile(McapPayloads):
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
             LogError: If the operating system can't open it.
         """
-        super().__init__(path)
-        self.profile = self.library = self.cut = ""
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.blocks: list[Block] = []
-        self.counts: dict[int, int] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, Attachment] = {}
-        self.appendices: list[Attachment | Metadata] = []
-        self.warnings: list[str] = []
+        McapPayloads.__init__(self, path)
+        Contents.__init__(self)
+        self.cut = ""
         try:
             self._find_contents(bare=bare)
         except BaseException:
@@ -328,11 +348,7 @@ class McapFile(McapPayloads):
             _Summary(self).read()
         except _NoSummaryError as why:
             # What a damaged summary says of channels may be wrong as well.
-            for found in (self.schemas, self.channels, self.counts, self.metadata):
-                found.clear()
-            self.attachments.clear()
-            self.blocks.clear()
-            self.appendices.clear()
+            Contents.__init__(self)
             _Scan(self).read()
             self.cut = str(why)
             self.warnings.append(f"{why}; read record by record")
@@ -359,13 +375,9 @@ class McapFile(McapPayloads):
             channel = self.parse(Channel.read, data, start, stop)
             self.channels[channel.id] = channel
         elif opcode == Opcode.ATTACHMENT:
-            attachment = self.parse(Attachment.read, data, start, stop)
-            self.attachments[attachment.name] = attachment
-            self.appendices.append(attachment)
+            self.append(self.parse(Attachment.read, data, start, stop))
         elif opcode == Opcode.METADATA:
-            metadata = self.parse(Metadata.read, data, start, stop)
-            self.metadata.setdefault(metadata.name, {}).update(metadata.metadata)
-            self.appendices.append(metadata)
+            self.append(self.parse(Metadata.read, data, start, stop))
 
     def parse(
         self, read: Callable[[ReadDataStream], _Record], data: Buffer, start: int, stop: int

@@ -10,12 +10,13 @@ import threading
 import weakref
 import zlib
 from collections import OrderedDict, deque
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zstandard
 
+from ...common.arrays import merged_ranges
 from ...common.errors import InputFileError, LogError, NotALogError
 from ...common.remote import HEAD_SIZE, RemoteFile, RemotePath
 from .chunk import (
@@ -138,7 +139,7 @@ class FetchedFile:
         with self._lock:
             pages = range(start // _PAGE, -(-stop // _PAGE))
             missing = [page * _PAGE for page in pages if page not in self._pages]
-            ranges = _merged((at, min(at + _PAGE, self._file.size)) for at in missing)
+            ranges = merged_ranges(((at, min(at + _PAGE, self._file.size)) for at in missing), 0)
             for (at, _), data in zip(ranges, self._file.read_many(ranges), strict=True):
                 self._write(at, data)
             self._whole = self._whole or (start == 0 and stop == self._file.size)
@@ -197,7 +198,7 @@ class FetchedFile:
             for one in batch
             if one is block or cache.get((self._owner, one.record_at)) is None
         ]
-        ranges = _merged(sorted(wanted), _GAP)
+        ranges = merged_ranges(sorted(wanted), _GAP)
         for (base, stop), data in zip(ranges, self._file.read_many(ranges), strict=True):
             for start, end in wanted:
                 if base <= start < stop:
@@ -234,17 +235,6 @@ class FetchedFile:
             written = os.pwrite(self._descriptor, data, at)
             at, data = at + written, data[written:]
         self._pages.update(pages)
-
-
-def _merged(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
-    """Join ranges, in order, that are no further apart than a gap."""
-    found: list[tuple[int, int]] = []
-    for start, stop in ranges:
-        if found and start <= found[-1][1] + gap:
-            found[-1] = found[-1][0], max(found[-1][1], stop)
-        else:
-            found.append((start, stop))
-    return found
 
 
 _CORRUPT = "is corrupt (its CRC doesn't fit)"

@@ -12,7 +12,7 @@ relative to the first byte after that header.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -101,22 +101,20 @@ def layout_of(message_type: MessageType, message: bytes) -> Layout:
         leaves=walker.leaves,
         strings=walker.strings,
         example=bytes(message),
-        hull=_complement(walker.leaves, len(message)),
+        hull=tuple(_complement(walker.leaves, len(message))),
         static=frozen(np.concatenate([np.arange(a, b, dtype=np.int64) for a, b in walker.static])),
     )
 
 
-def _complement(leaves: dict[str, Leaf], length: int) -> tuple[tuple[int, int], ...]:
-    """Return the byte ranges that no leaf covers, without empty ones."""
-    ranges: list[tuple[int, int]] = []
+def _complement(leaves: dict[str, Leaf], length: int) -> Iterator[tuple[int, int]]:
+    """Yield the byte ranges that no leaf covers, without empty ones."""
     at = 0
     for leaf in leaves.values():  # in wire order
         if leaf.offset > at:
-            ranges.append((at, leaf.offset))
+            yield at, leaf.offset
         at = leaf.offset + leaf.count * np.dtype(leaf.dtype).itemsize
     if length > at:
-        ranges.append((at, length))
-    return tuple(ranges)
+        yield at, length
 
 
 class _Walker:

@@ -10,13 +10,14 @@ ros2/rcl_interfaces (Rolling), without comments.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from ...common.errors import DataError
 
@@ -310,6 +311,20 @@ def _collect(short: str, order: list[str]) -> None:
         dependency = base if "/" in base else f"{short.partition('/')[0]}/{base}"
         if dependency not in order:
             _collect(dependency, order)
+
+
+VERDICTS = ("good", "degraded", "bad")
+"""Verdicts on a session, the worst last."""
+
+
+def stated_reasons(health: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the reasons of a record ``undulog.health``; what is no JSON list is one reason."""
+    text = health.get("reasons", "[]")
+    try:
+        found: object = json.loads(text)
+    except (ValueError, RecursionError):
+        return (text,)
+    return tuple(map(str, cast("list[object]", found) if isinstance(found, list) else [found]))
 
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3

@@ -14,7 +14,7 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -170,30 +170,23 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
                 record = ranges.get(index.offset, index.offset + index.length, _EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
-    if statistics is None or not statistics.message_count:
-        count = None if statistics is None else 0
-        return LogFacts(messages=count, topics=tuple(sorted(topics)), metadata=metadata)
-    return LogFacts(
-        start_ns=statistics.message_start_time,
-        end_ns=statistics.message_end_time,
-        messages=statistics.message_count,
-        topics=tuple(sorted(topics)),
-        metadata=metadata,
-    )
+    facts = LogFacts(topics=tuple(sorted(topics)), metadata=metadata)
+    if statistics is None:
+        return facts
+    count, start_ns = statistics.message_count, statistics.message_start_time
+    times = {"start_ns": start_ns, "end_ns": statistics.message_end_time} if count else {}
+    return replace(facts, messages=count, **times)
 
 
-def _records(data: bytes, start: int) -> list[tuple[int, bytes]]:
-    """Return opcode and body of each whole record."""
-    found: list[tuple[int, bytes]] = []
-    try:
-        for opcode, begin, end in walk_records(data, start, len(data)):
-            found.append((opcode, data[begin:end]))
-    except (McapError, struct.error):
-        pass  # the range ends within a record
-    return found
+def _records(data: bytes, start: int) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and body of each whole record."""
+    for opcode, begin, end in walk_records(data, start, len(data)):
+        yield opcode, data[begin:end]
 
 
-def _add_metadata(metadata: dict[str, dict[str, str]], records: list[tuple[int, bytes]]) -> None:
+def _add_metadata(
+    metadata: dict[str, dict[str, str]], records: Iterable[tuple[int, bytes]]
+) -> None:
     for opcode, body in records:
         if opcode == Opcode.METADATA:
             record = _parse(Metadata, body)

@@ -28,6 +28,7 @@ from ..messages.definitions import (
     JOINT_LISTS,
     JOINT_STATE,
     TRAJECTORY,
+    Field,
     MessageType,
 )
 
@@ -128,10 +129,8 @@ def is_of_joints(kind: MessageType) -> bool:
     fields = {field.name: field for field in kind.fields}
     if kind.name == FLOAT_ARRAY:
         return "data" in fields and fields["data"].base == "float64" and fields["data"].is_array
-    header = fields["header"].nested if "header" in fields else None
-    stamp = [field.nested for field in header.fields if field.name == "stamp"] if header else []
-    time = stamp[0] if stamp else None
-    if time is None or not {"sec", "nanosec"} <= {part.name for part in time.fields}:
+    stamp = _parts(_parts(fields.get("header")).get("stamp"))
+    if not {"sec", "nanosec"} <= stamp.keys():
         return False
     names = fields.get("name" if kind.name == JOINT_STATE else "joint_names")
     if names is None or names.base != "string" or not names.is_array:
@@ -140,16 +139,18 @@ def is_of_joints(kind: MessageType) -> bool:
         arrays = [fields.get(name) for name in UNITS]
         return all(one is not None and one.is_array and one.base for one in arrays)
     if kind.name == DYNAMIC_STATE:
-        nested = fields["interface_values"].nested if "interface_values" in fields else None
-        parts = {part.name: part.base for part in nested.fields} if nested is not None else {}
-        return parts == {"interface_names": "string", "values": "float64"}
-    point = fields.get("points" if kind.name == TRAJECTORY else "error")
-    points = (
-        {part.name: part.base for part in point.nested.fields} if point and point.nested else {}
-    )
-    return all(points.get(name) == "float64" for name in _POINT_FIELDS.values()) and (
-        kind.name != TRAJECTORY or [field.name for field in kind.fields] == _TRAJECTORY_FIELDS
-    )
+        parts = _parts(fields.get("interface_values"))
+        bases = {name: part.base for name, part in parts.items()}
+        return bases == {"interface_names": "string", "values": "float64"}
+    points = _parts(fields.get("points" if kind.name == TRAJECTORY else "error"))
+    return all(
+        name in points and points[name].base == "float64" for name in _POINT_FIELDS.values()
+    ) and (kind.name != TRAJECTORY or [field.name for field in kind.fields] == _TRAJECTORY_FIELDS)
+
+
+def _parts(field: Field | None) -> dict[str, Field]:
+    nested = None if field is None else field.nested
+    return {} if nested is None else {part.name: part for part in nested.fields}
 
 
 _TRAJECTORY_FIELDS = ["header", "joint_names", "points"]

@@ -90,22 +90,32 @@ class JointReader:
     """Joint signals of one session."""
 
     def __init__(
-        self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
+        self,
+        path: Path,
+        topics: Topics,
+        clock: StampClock,
+        warn: Callable[[str], None],
+        chain: Callable[[], Sequence[str]],
     ) -> None:
-        """Set up a reader; ``warn`` is called with one sentence for each irregularity."""
+        """Set up a reader.
+
+        Args:
+            warn: Called with one sentence for each irregularity.
+            chain: Returns joint names head to tail; joints not in it come after it.
+        """
         self._path, self._topics, self._clock, self._warn = path, topics, clock, warn
+        self._chain = chain
         self._offsets: dict[str, Series] = {}
         self._trajectories: dict[str, list[Trajectory]] = {}
 
     def read(
-        self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
     ) -> dict[tuple[str, str], JointSignals]:
         """Read fields of JointState topics in one pass over the file.
 
         Args:
             wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
-            chain: Joint names head to tail; joints not in it come after it.
 
         Returns:
             (topic, field) to signals.
@@ -120,7 +130,7 @@ class JointReader:
             found = self._topics.read(requests, widened(window_ns, NEAR_NS))
         if found is None or not covers(found, window_ns):
             found = self._topics.read(requests, widened(window_ns, SLACK_NS))
-        return self.signals(wanted, found, window_ns, chain)
+        return self.signals(wanted, found, window_ns)
 
     def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str] | None]:
         """Return the topics and leaf paths to read for some fields, with the offset topics.
@@ -199,14 +209,12 @@ class JointReader:
         wanted: Mapping[str, Sequence[str]],
         found: Mapping[str, Messages],
         window_ns: Window,
-        chain: Sequence[str],
     ) -> dict[tuple[str, str], JointSignals]:
         """Return the signals of messages that were read.
 
         Args:
             found: The messages of :meth:`requests`.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
-            chain: Joint names head to tail; joints not in it come after it.
 
         Returns:
             (topic, field) to signals.
@@ -233,7 +241,7 @@ class JointReader:
                         self._warn(f"{offset_topic} has no {name}: its message stamps are used")
         shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
         cuts = {each: cut(t_ns, window_ns) for each, t_ns in shared.items()}
-        return {key: self._signals(key, series[key], times[key], cuts, chain) for key in keys}
+        return {key: self._signals(key, series[key], times[key], cuts) for key in keys}
 
     def _offset_topic(self, topic: str) -> str | None:
         name = OFFSET_TOPICS.get(topic)
@@ -354,7 +362,6 @@ class JointReader:
         series: Series,
         times: Sequence[IntArray],
         cuts: Mapping[int, tuple[slice, IntArray]],
-        chain: Sequence[str],
     ) -> JointSignals:
         topic, field = key
         names = series.names
@@ -371,6 +378,7 @@ class JointReader:
             tuple(cuts[id(t_ns)][1] for t_ns in times),
             tuple(v[cuts[id(t_ns)][0]] for t_ns, v in zip(times, series.values, strict=True)),
         )
+        chain = self._chain()
         there, of_chain = set(names), set(chain)
         known = [name for name in chain if name in there]
         order = (*known, *(name for name in names if name not in of_chain))

@@ -7,7 +7,7 @@ leaves a choice the words of the topic's name; what was taken is reported.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -45,33 +45,27 @@ _LOOKED_AT = 2000
 _MOST_LISTED = 12
 
 
-def joint_names(topics: Topics, most: int = _LOOKED_AT) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each topic that names some, in the order in which they appear.
-
-    Args:
-        most: Messages that are looked at of a topic whose messages name one joint each.
-    """
-    found: dict[str, tuple[str, ...]] = {}
-    for topic, channel in topics.channels.items():
-        if channel.type_name not in JOINT_TYPES or not channel.is_ros2:
-            continue
-        try:
-            names = _names(topics, topic, most)
-        except DataError:  # a damaged schema or message: whoever reads the topic says so
-            continue
-        if names:
-            found[topic] = names
-    return found
+def joint_names(topics: Topics) -> dict[str, tuple[str, ...]]:
+    """Return the joints of each topic that names some, in the order in which they appear."""
+    found = {
+        topic: _names(topics, topic)
+        for topic, channel in topics.channels.items()
+        if channel.type_name in JOINT_TYPES and channel.is_ros2
+    }
+    return {topic: names for topic, names in found.items() if names}
 
 
-def _names(topics: Topics, topic: str, most: int) -> tuple[str, ...]:
-    decode = topics.decoder(topic)
+def _names(topics: Topics, topic: str) -> tuple[str, ...]:
     names: dict[str, None] = {}
-    for _, message in islice(topics.raw(topic), most):
-        own = _joints(decode(message))
-        names |= dict.fromkeys(own)
-        if len(own) > 1:  # all joints in one message
-            break
+    try:
+        decode = topics.decoder(topic)
+        for _, message in islice(topics.raw(topic), _LOOKED_AT):
+            own = _joints(decode(message))
+            names |= dict.fromkeys(own)
+            if len(own) > 1:  # all joints in one message
+                break
+    except DataError:  # a damaged schema or message: whoever reads the topic says so
+        return ()
     return tuple(names)
 
 
@@ -171,6 +165,11 @@ class _Candidate:
     joints: tuple[str, ...]
 
 
+def _sorted(candidates: Iterable[_Candidate], without: str) -> list[_Candidate]:
+    kept = (one for one in candidates if one.name != without)
+    return sorted(kept, key=lambda one: (one.rank, -one.count, one.name))
+
+
 class JointTopicFinder:
     """Finds the commands and responses of one log."""
 
@@ -203,8 +202,8 @@ class JointTopicFinder:
         if not search:
             return JointTopics(command, response, quantities, notes=notes)
         every = joint_names(self._topics)
-        commands = [one for one in self._commands(every) if one.name != response]
-        responses = [one for one in self._responses(every) if one.name != command]
+        commands = _sorted(self._commands(every), response)
+        responses = _sorted(self._responses(every), command)
         taken: dict[str, str] = {}
         known = every.get(response, ())
         if COMMAND_TOPIC in search and commands:
@@ -265,37 +264,33 @@ class JointTopicFinder:
             f"--command-topic {option} (or --response-topic), or give a robot that has so many"
         )
 
-    def _commands(self, every: Mapping[str, tuple[str, ...]]) -> list[_Candidate]:
-        found: list[_Candidate] = []
+    def _commands(self, every: Mapping[str, tuple[str, ...]]) -> Iterator[_Candidate]:
         for topic, kind, count in self._joint_topics():
             words, joints = _words(topic), every.get(topic, ())
             if kind == CONTROLLER_STATE:
-                filled = self._filled(topic, COMMAND_PARTS)[:1]
-                found += [_Candidate(f"{topic}.{one}", topic, 0, count, joints) for one in filled]
+                for one in self._filled(topic, COMMAND_PARTS)[:1]:
+                    yield _Candidate(f"{topic}.{one}", topic, 0, count, joints)
             elif kind == FLOAT_ARRAY:
                 of_angles = bool(words & _COMMAND_WORDS) and not words & _NO_ANGLES
                 if of_angles and self._joints and self._width(topic) == len(self._joints):
                     name = self._named_array(topic)
-                    found.append(_Candidate(name, topic, 3, count, self._joints))
+                    yield _Candidate(name, topic, 3, count, self._joints)
             elif kind == TRAJECTORY:
-                found.append(_Candidate(topic, topic, 2, count, joints))
+                yield _Candidate(topic, topic, 2, count, joints)
             elif words & _COMMAND_WORDS:
-                found.append(_Candidate(topic, topic, 1, count, joints))
-        return sorted(found, key=lambda one: (one.rank, -one.count, one.name))
+                yield _Candidate(topic, topic, 1, count, joints)
 
-    def _responses(self, every: Mapping[str, tuple[str, ...]]) -> list[_Candidate]:
-        found: list[_Candidate] = []
+    def _responses(self, every: Mapping[str, tuple[str, ...]]) -> Iterator[_Candidate]:
         for topic, kind, count in self._joint_topics():
             joints = every.get(topic, ())
             if kind == CONTROLLER_STATE:
-                filled = self._filled(topic, STATE_PARTS)[:1]
-                found += [_Candidate(f"{topic}.{one}", topic, 1, count, joints) for one in filled]
+                for one in self._filled(topic, STATE_PARTS)[:1]:
+                    yield _Candidate(f"{topic}.{one}", topic, 1, count, joints)
             elif kind == DYNAMIC_STATE:
-                found.append(_Candidate(topic, topic, 2, count, joints))
+                yield _Candidate(topic, topic, 2, count, joints)
             elif kind == JOINT_STATE and not _words(topic) & _COMMAND_WORDS:
                 usual = topic.rsplit("/", 1)[-1] == RESPONSE_TOPIC[1:]
-                found.append(_Candidate(topic, topic, 0 if usual else _UNNAMED, count, joints))
-        return sorted(found, key=lambda one: (one.rank, -one.count, one.name))
+                yield _Candidate(topic, topic, 0 if usual else _UNNAMED, count, joints)
 
     def _joint_topics(self) -> list[tuple[str, str, int]]:
         """Return topic, type and number of messages of topics that could be either."""

@@ -18,11 +18,10 @@ from ...common.remote import as_path
 from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
-from ..columns.topics import Channel, Topics
+from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.definitions import newer_contract
 from ..messages.frames import FrameArray, join_batches
-from .joint_messages import JointRows
 from .joint_states import JointReader
 from .joint_topics import JointTopicFinder, JointTopics, check_joints
 from .sample_times import JointSignals, StampClock
@@ -66,7 +65,7 @@ class OpenLog:
             self.warnings.append(newer)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)
-        self._joints = JointReader(path, self.topics, self._clock, self._warn)
+        self.joints = JointReader(path, self.topics, self._clock, self._warn, lambda: self._chain)
         self.robot_given = None if described is None else self._given(str(robot), described)
 
     @cached_property
@@ -116,26 +115,6 @@ class OpenLog:
         """Find commands and responses; see :meth:`.SessionView.joint_topics`."""
         return JointTopicFinder(self.path, self.topics, self._chain).find(command, response)
 
-    def joint_channel(self, name: str) -> Channel | None:
-        """Return the JointStates that a name of joints is read as; None if there are none."""
-        return self._joints.channel(name)
-
-    def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
-        """Return the fields of a topic and their joints; see :meth:`.JointReader.carried`."""
-        return self._joints.carried(name)
-
-    def joint_messages(
-        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
-    ) -> dict[tuple[str, str], list[JointRows]]:
-        """Return messages as they were logged; see :meth:`.JointReader.logged`."""
-        return self._joints.logged(wanted, window_ns)
-
-    def joints(
-        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
-    ) -> dict[tuple[str, str], JointSignals]:
-        """Read signals in one pass; see :meth:`.SessionView.joint_columns`."""
-        return self._joints.read(wanted, window_ns, self._chain)
-
     def joint_orders(self, topic: str, window_ns: Window) -> list[tuple[str, ...]]:
         """See :meth:`.SessionView.joint_orders`."""
         found = self.topics.read({topic: ()}, window_ns)[topic]
@@ -154,12 +133,12 @@ class OpenLog:
         tables: Mapping[str, Sequence[str] | None],
     ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
         """Read all of the log in one pass; see :meth:`.SessionView.columns`."""
-        requests: dict[str, Sequence[str] | None] = dict(self._joints.requests(joints))
+        requests: dict[str, Sequence[str] | None] = dict(self.joints.requests(joints))
         if twice := sorted(requests.keys() & tables.keys()):
             raise DataError(f"{', '.join(twice)}: ask for signals or for a table, not for both")
         found = self.topics.read(requests | dict(tables), (None, None))
         read = self._as_tables(tables, found)
-        return self._joints.signals(joints, found, (None, None), self._chain), read
+        return self.joints.signals(joints, found, (None, None)), read
 
     def frames(
         self, topic: str, window_ns: Window, dtype: np.dtype[np.void], label: str
@@ -193,10 +172,7 @@ class OpenLog:
         self, wanted: Mapping[str, Sequence[str] | None], found: dict[str, Messages]
     ) -> dict[str, pd.DataFrame]:
         """Return tables of some messages, which are removed from ``found`` one by one."""
-        read: dict[str, pd.DataFrame] = {}
-        for topic in wanted:
-            read[topic] = self._table(topic, found.pop(topic))
-        return read
+        return {topic: self._table(topic, found.pop(topic)) for topic in wanted}
 
     def _table(self, topic: str, found: Messages) -> pd.DataFrame:
         import pandas as pd  # a third of a second, which only tables need
@@ -216,9 +192,8 @@ def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """Return one layout group as a table."""
     import pandas as pd
 
-    columns: dict[str, Any] = {}
-    for path, text in group.strings.items():
-        columns[path] = np.full(len(group), text, dtype=object)
+    strings = group.strings.items()
+    columns: dict[str, Any] = {k: np.full(len(group), text, dtype=object) for k, text in strings}
     for path in group.paths:
         values = group.values(path)
         if group.layout.leaves[path].is_array:

@@ -10,14 +10,14 @@ the stamps; how the motion continues over the gap is unknown.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...common.arrays import NS, FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray, merged_ranges
 from ...common.errors import DataError
 from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
@@ -88,13 +88,11 @@ class JointSignals:
             DataError: If there is no such joint.
         """
         chosen = [self.signal(name) for name in names]
-        return JointSignals(
-            self.topic,
-            self.field,
-            self.unit,
-            tuple(signal.name for signal in chosen),
-            tuple(signal.t_ns for signal in chosen),
-            tuple(signal.values for signal in chosen),
+        return replace(
+            self,
+            names=tuple(signal.name for signal in chosen),
+            t_ns=tuple(signal.t_ns for signal in chosen),
+            values=tuple(signal.values for signal in chosen),
         )
 
     def frame(self) -> pd.DataFrame:
@@ -169,12 +167,7 @@ def longest_unbroken(
         for t_ns in {id(each): each for each in times_ns}.values()
         for run in _runs(cut(t_ns, (start_ns, stop_ns))[1])
     ]
-    joined: list[tuple[int, int]] = []
-    for first, last in sorted(runs):
-        if joined and first - joined[-1][1] <= BREAK_S * NS:
-            joined[-1] = joined[-1][0], max(joined[-1][1], last)
-        else:
-            joined.append((first, last))
+    joined = merged_ranges(sorted(runs), BREAK_S * NS)
     if not joined:
         return None
     longest = max(joined, key=lambda run: run[1] - run[0])
@@ -326,14 +319,12 @@ def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]
 
 def _each_own(series: Series, offsets: Series) -> list[IntArray]:
     place = {name: j for j, name in enumerate(offsets.names)}
-    own: list[IntArray] = []
-    for name, t_ns in zip(series.names, series.t_ns, strict=True):
-        j = place.get(name)
-        if j is None or not len(offsets.t_ns[j]):
-            own.append(t_ns)
-            continue
-        own.append(moved(t_ns, offsets.t_ns[j], offsets.values[j]))
-    return own
+    return [
+        moved(t_ns, offsets.t_ns[j], offsets.values[j])
+        if (j := place.get(name)) is not None and len(offsets.t_ns[j])
+        else t_ns
+        for name, t_ns in zip(series.names, series.t_ns, strict=True)
+    ]
 
 
 def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:

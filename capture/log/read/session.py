@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Self
 
 from ...common.amounts import format_size
 from ...common.console import plain
+from ...common.files import Closing
 from ...common.process import threads_or_default
 from ...common.remote import as_path
 from .open_log import OpenLog
@@ -21,7 +22,6 @@ from .session_view import SessionView
 
 if TYPE_CHECKING:
     from ..columns.topics import Channel
-    from .session_view import SessionView
 
 
 _HEAD = "".join(f"<th>{name}</th>" for name in ("topic", "type", "messages", "rate [Hz]", "unit"))
@@ -67,7 +67,7 @@ def _text(text: str) -> str:
     return escape(plain(text))
 
 
-class Session(SessionView):
+class Session(Closing, SessionView):
     """A recorded session, opened for reading: a view of the whole, which can be closed."""
 
     def __init__(
@@ -129,11 +129,3 @@ class Session(SessionView):
     def close(self) -> None:
         """Release the file."""
         self._log.file.close()
-
-    def __enter__(self) -> Self:
-        """Return the session."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Release the file."""
-        self.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from .sample_times import JointSignals
 if TYPE_CHECKING:
     import pandas as pd
 
+_Found = TypeVar("_Found")
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 
@@ -50,8 +51,12 @@ class SessionView(SessionFacts):
             limits_ns: Start and end that the view states; those of the window if None.
         """
         super().__init__(log)
-        self._window_ns, self._limits_ns = window_ns, limits_ns
-        self._names, self._on_read = names, on_read
+        self._window_ns, self._names, self._on_read = window_ns, names, on_read
+        (first_ns, last_ns), (start_ns, stop_ns) = log.file.limits, window_ns
+        start_ns = first_ns if start_ns is None else max(first_ns, start_ns)
+        end_ns = last_ns if stop_ns is None else min(last_ns, stop_ns)
+        self.start_ns, self.end_ns = limits_ns or (start_ns, end_ns)
+        """Log times of the first and the last message, or the limits of the view [Unix ns]."""
 
     def view(
         self,
@@ -120,7 +125,7 @@ class SessionView(SessionFacts):
         Raises:
             DataError: If the topic has no joints.
         """
-        return self.channels.get(name) or self._log.joint_channel(name)
+        return self.channels.get(name) or self._log.joints.channel(name)
 
     def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
         """Return the fields that a topic ever has, each with its joints in order of appearance.
@@ -129,7 +134,7 @@ class SessionView(SessionFacts):
             MissingChannelError: If the session has no such topic.
             DataError: If it has no joints.
         """
-        return self._log.joint_fields(self._logged(name))
+        return self._log.joints.carried(self._logged(name))
 
     def joint_messages(
         self,
@@ -152,14 +157,8 @@ class SessionView(SessionFacts):
             MissingChannelError: If the session has no such topic.
             DataError: If a topic has no joints or a field is none of the three.
         """
-        self._on_read()
-        logged = {self._logged(topic): fields for topic, fields in wanted.items()}
-        found = self._log.joint_messages(logged, self._within(start_ns, stop_ns))
-        return {
-            (topic, field): found[self._logged(topic), field]
-            for topic, fields in wanted.items()
-            for field in fields
-        }
+        window_ns = self._within(start_ns, stop_ns)
+        return self._of_joints(wanted, lambda logged: self._log.joints.logged(logged, window_ns))
 
     def message_type(self, topic: str) -> MessageType:
         """Return the type of a topic's messages.
@@ -225,28 +224,10 @@ class SessionView(SessionFacts):
         found = {
             name: replace(channel, topic=name)
             for name, topic in self._names.items()
-            if (channel := logged.get(topic) or self._log.joint_channel(topic)) is not None
+            if (channel := logged.get(topic) or self._log.joints.channel(topic)) is not None
         }
         found |= {topic: channel for topic, channel in logged.items() if topic not in away}
         return MappingProxyType(found)
-
-    @property
-    def start_ns(self) -> int:
-        """Log time of the first message [Unix ns]; 0 without messages."""
-        if self._limits_ns is not None:
-            return self._limits_ns[0]
-        start_ns = self._window_ns[0]
-        first_ns = self._log.file.limits[0]
-        return first_ns if start_ns is None else max(first_ns, start_ns)
-
-    @property
-    def end_ns(self) -> int:
-        """Log time of the last message [Unix ns], or the window's end; 0 without messages."""
-        if self._limits_ns is not None:
-            return self._limits_ns[1]
-        stop_ns = self._window_ns[1]
-        last_ns = self._log.file.limits[1]
-        return last_ns if stop_ns is None else min(last_ns, stop_ns)
 
     @property
     def duration_s(self) -> float:
@@ -304,16 +285,8 @@ class SessionView(SessionFacts):
             MissingChannelError: If the session has no such topic, or it never carries the field.
             DataError: If a topic is not of JointStates or a field is none of the three.
         """
-        self._on_read()
-        logged: dict[str, list[str]] = {}
-        for topic, fields in wanted.items():
-            logged.setdefault(self._logged(topic), []).extend(fields)
-        found = self._log.joints(logged, self._within(start_ns, stop_ns))
-        return {
-            (topic, field): found[self._logged(topic), field]
-            for topic, fields in wanted.items()
-            for field in fields
-        }
+        window_ns = self._within(start_ns, stop_ns)
+        return self._of_joints(wanted, lambda logged: self._log.joints.read(logged, window_ns))
 
     def joint_orders(self, topic: str) -> list[tuple[str, ...]]:
         """Return the lists of joints that messages of a JointState topic have, as they have them.
@@ -428,6 +401,20 @@ class SessionView(SessionFacts):
         return self._frames(topic, (start_ns, stop_ns), FD_FRAME_DTYPE, FD_FRAME_LAYOUT)
 
     # -- inside ----------------------------------------------------------------------------
+
+    def _of_joints(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        read: Callable[[Mapping[str, Sequence[str]]], Mapping[tuple[str, str], _Found]],
+    ) -> dict[tuple[str, str], _Found]:
+        """Read fields by the names that the log has, and return them by those of the view."""
+        self._on_read()
+        logged: dict[str, list[str]] = {}
+        for topic, fields in wanted.items():
+            logged.setdefault(self._logged(topic), []).extend(fields)
+        found = read(logged)
+        keys = ((topic, field) for topic, fields in wanted.items() for field in fields)
+        return {(topic, field): found[self._logged(topic), field] for topic, field in keys}
 
     def _tables(
         self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError, LogWriteError
+from ...common.files import Closing
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
 from ..mcap.chunk import BODY_AT
@@ -41,7 +42,7 @@ from .channels import (
 from .mcap_sink import McapSink, MessageSink, own_version
 
 
-class SessionWriter:
+class SessionWriter(Closing):
     """Writes one session.
 
     A method that opens a channel raises DataError if its topic is open already; the channel may be
@@ -99,14 +100,6 @@ class SessionWriter:
                 self.attach(name, "text/plain", text.encode())
             for name, data in robot.meshes:
                 self.attach(name, mesh_type(name) or "application/octet-stream", data)
-
-    def __enter__(self) -> Self:
-        """Return the session."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Finalise the session, also when the block is left by an exception."""
-        self.close()
 
     # -- channels --------------------------------------------------------------------------
 

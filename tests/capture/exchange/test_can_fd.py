@@ -141,7 +141,7 @@ def session_of_every_kind(tmp_path_factory):
 def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / f"x{suffix}")
-    assert (report.buses, report.warnings) == ({"can0": len(frames)}, [])
+    assert (report.facts["buses"], report.warnings) == ({"can0": len(frames)}, [])
     _, back = imported(tmp_path / f"x{suffix}", tmp_path, FD)
     expected = frames.copy()
     if suffix == ".asc":  # without the date
@@ -259,7 +259,7 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path):
     import_can(tmp_path / "x.log", tmp_path / "run.mcap", load_robot("snake13"))
     report = export_log(tmp_path / "run.mcap", tmp_path / "back.log")
     assert (tmp_path / "back.log").read_text() == text
-    assert report.buses == {"can0": 3000 - 429, "vcan1": 429}
+    assert report.facts["buses"] == {"can0": 3000 - 429, "vcan1": 429}
     report = export_log(tmp_path / "run.mcap", tmp_path / "one.log", bus="vcan1")
     expected = [line for line in text.splitlines() if " vcan1 " in line]
     assert (tmp_path / "one.log").read_text().splitlines() == expected
@@ -269,11 +269,11 @@ def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path):
     frames = every_kind(fd=True)
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
     report = export_log(write_frames(tmp_path / "run.mcap", topics), tmp_path / "x.mcap")
-    assert report.buses == {"can0": 50}
+    assert report.facts["buses"] == {"can0": 50}
     left_out = f"{len(frames)} CAN FD frames left out: the format has 8 bytes a frame"
     assert report.warnings == [left_out]
     report = export_log(session_of_every_kind[0], tmp_path / "y.mcap")
-    assert (report.buses, report.warnings) == ({"can0": 0}, [left_out])
+    assert (report.facts["buses"], report.warnings) == ({"can0": 0}, [left_out])
 
 
 def test_what_a_format_loses_is_counted(tmp_path):

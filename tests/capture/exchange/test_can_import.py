@@ -37,7 +37,7 @@ def arcsnake(tmp_path_factory):
 def test_the_arcsnake_log_comes_back_bit_for_bit(arcsnake, tmp_path):
     path, report = arcsnake
     assert (report.frames, report.verdict, report.problems) == (19_297, "good", [])
-    assert export_log(path, tmp_path / "back.log").buses == {"can0": 19_297}
+    assert export_log(path, tmp_path / "back.log").facts["buses"] == {"can0": 19_297}
     assert (tmp_path / "back.log").read_bytes() == RECORDING.read_bytes()
 
 

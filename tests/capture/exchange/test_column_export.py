@@ -66,10 +66,10 @@ def test_each_sample_has_a_row_at_its_own_time(
     monkeypatch.setattr("undulog.capture.exchange.export._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
     report = export_columns(polled, output)
-    assert report.rows == {"/joint_states": 600, "/joint_current": 600}
+    assert report.facts["topics"] == {"/joint_states": 600, "/joint_current": 600}
     assert report.warnings == []
     table = READ[suffix](output)
-    assert list(table.columns) == report.columns == ["t_ns", "topic", "joint", *COLUMNS]
+    assert list(table.columns) == ["t_ns", "topic", "joint", *COLUMNS]
     assert table["t_ns"].dtype == np.int64
     with Session.open(polled) as session:
         topics = ("/joint_states", "/joint_states", "/joint_current")
@@ -83,7 +83,7 @@ def test_each_sample_has_a_row_at_its_own_time(
 
 def test_topics_can_be_chosen(polled, tmp_path):
     report = export_columns(polled, tmp_path / "x.csv", topics=["/gait", "/joint_current", "/gait"])
-    assert report.rows == {"/gait": 200, "/joint_current": 600}
+    assert report.facts["topics"] == {"/gait": 200, "/joint_current": 600}
     table = pd.read_csv(tmp_path / "x.csv")
     assert set(table["joint"][table["topic"] == "/gait"]) == {"horizontal.A"}
     with pytest.raises(MissingChannelError, match="has no /no; it has /gait, /joint_current"):
@@ -107,7 +107,7 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path):
         messages.append(("/servo/states", T0 + k * 1_000_000, content))
     write_foreign(tmp_path / "run.mcap", messages)
     report = export_columns(tmp_path / "run.mcap", tmp_path / f"x{suffix}")
-    assert report.rows == {"/servo/states": 60}
+    assert report.facts["topics"] == {"/servo/states": 60}
     table = READ[suffix](tmp_path / f"x{suffix}")
     position = table.dropna(subset=["servo/states.position [rad]"])
     assert position["servo/states.position [rad]"].tolist() == [k * 0.1 for k in range(40)]
@@ -137,8 +137,8 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
     report = export_columns(tmp_path / "run.mcap", tmp_path / "all.csv")
     table = pd.read_csv(tmp_path / "all.csv")
     with Session.open(tmp_path / "run.mcap") as session:
-        assert sum(report.rows.values()) == len(table)
-        for topic, column in zip(report.rows, report.columns[3:], strict=True):
+        assert report.facts["rows"] == len(table)
+        for topic, column in zip(report.facts["topics"], list(table.columns)[3:], strict=True):
             assert_same_samples(table, session, topic, "position", column)
         states = session.joints("/joint_states").signal("joint01")
     export_columns(tmp_path / "run.mcap", tmp_path / "x.csv", topics=["/joint_states"])

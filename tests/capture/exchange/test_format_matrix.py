@@ -207,7 +207,7 @@ def test_export_and_import(suffix, frames):
         report = export_log(session_of(folder / "run.mcap", frames), trace)
         back, _ = imported(trace, folder)
     expected = by_bus([held(each) for each in frames])
-    assert report.buses == {bus: len(own) for bus, own in by_bus(frames).items()}
+    assert report.facts["buses"] == {bus: len(own) for bus, own in by_bus(frames).items()}
     assert sorted(report.warnings) == losses(frames, held, sub_us=suffix == ".asc")
     same_but_time(back, expected)
     # ASC has its date as local time, and an import leaves it alone: its times count from 2000.

@@ -56,7 +56,7 @@ def test_each_frame_holds_the_last_sample_and_its_time(made):
     runs, folder, report = made
     frames = frames_of(folder)
     episodes = pd.read_parquet(folder / "meta/episodes/chunk-000/file-000.parquet")
-    assert report.episodes == episodes["length"].tolist()
+    assert report.facts["episodes"] == episodes["length"].tolist()
     for number, path in enumerate(runs):
         own = frames[frames["episode_index"] == number]
         assert own["frame_index"].tolist() == list(range(len(own)))
@@ -81,7 +81,7 @@ def test_each_frame_holds_the_last_sample_and_its_time(made):
 def test_the_description_fits_the_files(made):
     _, folder, _ = made
     info = json.loads((folder / "meta/info.json").read_text())
-    frames, count = frames_of(folder), sum(made[2].episodes)
+    frames, count = frames_of(folder), sum(made[2].facts["episodes"])
     assert info["codebase_version"] == "v3.0"
     assert (info["total_episodes"], info["total_frames"], info["fps"]) == (3, count, 30)
     assert info["splits"] == {"train": "0:3"}
@@ -97,7 +97,7 @@ def test_the_description_fits_the_files(made):
     tasks = pd.read_parquet(folder / "meta/tasks.parquet")
     assert tasks.loc["wave", "task_index"] == 0
     episodes = pd.read_parquet(folder / "meta/episodes/chunk-000/file-000.parquet")
-    assert episodes["dataset_to_index"].tolist() == np.cumsum(made[2].episodes).tolist()
+    assert episodes["dataset_to_index"].tolist() == np.cumsum(made[2].facts["episodes"]).tolist()
     assert episodes["dataset_from_index"].iloc[0] == 0
     assert episodes["tasks"].map(list).tolist() == [["wave"]] * 3
 
@@ -141,7 +141,7 @@ def test_a_real_dataset_comes_back(tmp_path):
     for number, path in enumerate(sorted((G1 / "data" / "chunk-000").iterdir())):
         original = pd.read_parquet(path)
         own = frames[frames["episode_index"] == number]
-        assert len(own) == len(original) == report.episodes[number]
+        assert len(own) == len(original) == report.facts["episodes"][number]
         for name in (*FEATURES, "frame_index", "timestamp"):
             np.testing.assert_array_equal(np.stack(own[name]), np.stack(original[name]))
 
@@ -160,7 +160,7 @@ def test_one_joint_is_a_plain_number(tmp_path):
 def test_what_is_lost_is_reported(tmp_path):
     path = write_commands(tmp_path / "run.mcap", ["a"], [[float(k)] for k in range(101)])
     report = export_lerobot([path], tmp_path / "set", fps=50)  # commands come 100 times a second
-    assert report.episodes == [51]
+    assert report.facts["episodes"] == [51]
     assert report.warnings[0] == "no /joint_states: no observation.state"
     assert report.warnings[-1].startswith(
         "action at 50 frames a second: 50 of 101 samples left out, values up to 0 s old (a)"

@@ -73,7 +73,7 @@ def test_each_path_of_foxglove_leads_to_its_joint(run, tmp_path, command):
 
 def test_plotjuggler_has_a_plot_for_each_joint(run, tmp_path, opened):
     report = export_plotjuggler_layout(run, tmp_path / "x.xml")
-    assert report.joints == NAMES
+    assert report.facts["joints"] == NAMES
     root = ET.parse(tmp_path / "x.xml").getroot()
     for splitter in root.iter("DockSplitter"):
         assert int(splitter.get("count")) == len(splitter) == len(splitter.get("sizes").split(";"))
@@ -97,10 +97,10 @@ def test_a_joint_whose_place_changes_is_not_plotted_by_place(tmp_path):
     ]
     write_foreign(tmp_path / "run.mcap", messages)
     report = export_foxglove_layout(tmp_path / "run.mcap", tmp_path / "x.json")
-    assert report.joints == ["c"]
+    assert report.facts["joints"] == ["c"]
     assert report.warnings[-1].endswith("these have no curve: a, b")
     report = export_plotjuggler_layout(tmp_path / "run.mcap", tmp_path / "x.xml")
-    assert report.joints == ["a", "b", "c"]
+    assert report.facts["joints"] == ["a", "b", "c"]
     orders = [["a", "b", "c"], ["b", "c", "a"]]
     messages = [
         ("/joint_states", T0 + k, joint_state(T0 + k, order, [0.1, 0.2, 0.3]))
@@ -116,10 +116,10 @@ def test_odd_names_and_topics(tmp_path):
     messages = [("/a b/x", T0 + k, joint_state(T0 + k, names, [k, np.nan, 0.0])) for k in (0, 1)]
     write_foreign(tmp_path / "run.mcap", messages)
     report = export_plotjuggler_layout(tmp_path / "run.mcap", tmp_path / "x.xml", topics=["/a b/x"])
-    assert report.joints == [names[0], names[2]]
+    assert report.facts["joints"] == [names[0], names[2]]
     assert report.warnings[-1].startswith("names that XML can't hold, left out")
     curves = [each.get("name") for each in ET.parse(tmp_path / "x.xml").getroot().iter("curve")]
-    assert curves == [f"/a b/x/{name}/position" for name in report.joints]
+    assert curves == [f"/a b/x/{name}/position" for name in report.facts["joints"]]
     export_foxglove_layout(tmp_path / "run.mcap", tmp_path / "x.json", topics=["/a b/x"])
     layout = json.loads((tmp_path / "x.json").read_text())
     assert layout["configById"]["Plot!joint1"]["paths"][0]["value"] == '"/a b/x".position[0]'

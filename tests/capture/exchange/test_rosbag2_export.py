@@ -38,23 +38,23 @@ def test_messages_are_those_of_the_session_byte_for_byte(bag, tmp_path):
     assert {path.name for path in folder.iterdir()} == {"metadata.yaml", "bag_0.mcap"}
     expected = messages_of(tmp_path / "run.mcap")
     assert messages_of(folder / "bag_0.mcap") == expected
-    assert sum(report.messages.values()) == len(expected)
+    assert sum(report.facts["messages"].values()) == len(expected)
     with Reader(folder) as reader:
         by_rosbags = [(c.msgtype, c.topic, t, bytes(data)) for c, t, data in reader.messages()]
         counts = {each.topic: each.msgcount for each in reader.connections}
     assert sorted(by_rosbags) == sorted((n, t, log, data) for n, t, log, _, data in expected)
-    assert counts == report.messages
+    assert counts == report.facts["messages"]
 
 
 def test_rosbags_decodes_every_type(bag):
     folder, report = bag
     store = get_typestore(Stores.EMPTY)
-    seen = dict.fromkeys(report.messages, 0)
+    seen = dict.fromkeys(report.facts["messages"], 0)
     positions = []
     with Reader(folder) as reader:
         assert (reader.start_time, reader.message_count) == (
             EPOCH_NS,
-            sum(report.messages.values()),
+            sum(report.facts["messages"].values()),
         )
         assert reader.duration == 299 * 10_000_000 + 1
         for connection in reader.connections:
@@ -65,7 +65,7 @@ def test_rosbags_decodes_every_type(bag):
             if connection.topic == "/joint_states":
                 assert tuple(message.name) == NAMES
                 positions.append(message.position)
-    assert seen == report.messages
+    assert seen == report.facts["messages"]
     np.testing.assert_array_equal(positions, samples()[:, 0])
 
 
@@ -95,7 +95,7 @@ def test_an_exported_session_comes_back_bit_for_bit(bag, tmp_path, command, repo
     folder, exported = bag
     session, back = tmp_path / "run.mcap", tmp_path / "back.mcap"
     report = report_of("import", folder, "-o", back)
-    assert report["messages"] == exported.messages
+    assert report["messages"] == exported.facts["messages"]
     assert (report["verdict"], report["problems"]) == ("good", [])
     assert "exported by undulog, is copied as it is" in report["notes"][0]
     assert sorted(messages_of(back)) == sorted(messages_of(session))
@@ -140,7 +140,7 @@ def test_what_is_no_message_of_ros_is_left_out(tmp_path):
     json_channel = ("/status", "json", "Status", "jsonschema", b"{}", b"{}")
     path = write_mcap(tmp_path / "run.mcap", [("/a/01", *TEXT), json_channel])
     report = export_rosbag2(path, tmp_path / "bag")
-    assert report.messages == {"/a/01": 1}
+    assert report.facts["messages"] == {"/a/01": 1}
     assert "not messages of ROS 2, left out: /status" in report.warnings
     assert report.warnings[-1].endswith("of ros2 bag play: /a/01")
     with Reader(tmp_path / "bag") as reader:

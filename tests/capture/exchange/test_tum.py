@@ -91,7 +91,7 @@ def test_a_stamped_pose_has_the_name_of_its_topic(tmp_path):
         writer.write_message("/mocap", schema, message, log_time=T0, publish_time=T0)
         writer.finish()
     report = export_tum(tmp_path / "run.mcap", tmp_path / "x.tum")
-    assert (report.frame, report.parent) == ("/mocap", "map")
+    assert (report.facts["frame"], report.facts["parent"]) == ("/mocap", "map")
     assert read(tmp_path / "x.tum")[1] == [T0 + 7]
 
 
@@ -118,7 +118,7 @@ def test_a_link_of_transforms_that_change_from_message_to_message(tmp_path, comm
         messages.append(("/tf", t_ns + 77, {"transforms": own}))
     write_foreign(tmp_path / "run.mcap", messages, TF)
     report = export_tum(tmp_path / "run.mcap", tmp_path / "x.tum", frame="link1")
-    assert (report.parent, report.topic) == ("base", "/tf")
+    assert (report.facts["parent"], report.facts["topic"]) == ("base", "/tf")
     _, times, numbers = read(tmp_path / "x.tum")
     assert times == [T0 + k * 1_000 for k in range(1, 40, 2)]
     np.testing.assert_array_equal(numbers, np.hstack([positions, turns])[1::2])
@@ -136,4 +136,4 @@ def test_what_has_no_trajectory_is_refused(tmp_path):
     write_session(tmp_path / "odom.mcap")
     with pytest.raises(UsageError, match=r"end the name of a trajectory in \.tum or \.txt"):
         export_tum(tmp_path / "odom.mcap", tmp_path / "x.csv")
-    assert export_tum(tmp_path / "odom.mcap", tmp_path / "x.tum").frame == "link01"
+    assert export_tum(tmp_path / "odom.mcap", tmp_path / "x.tum").facts["frame"] == "link01"

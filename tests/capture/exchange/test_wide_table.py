@@ -94,8 +94,8 @@ def test_real_recordings_come_back(name, suffix, tmp_path, opened):
 def test_a_column_holds_the_samples_of_a_joint_at_their_times(suffix, staggered, tmp_path, opened):
     report = export_wide(staggered, tmp_path / f"x{suffix}")
     table = READ[suffix](tmp_path / f"x{suffix}")
-    assert list(table.columns) == report.columns
-    assert len(table) == report.rows == 300 * 3 + 30 * 2
+    assert list(table.columns) == report.facts["columns"]
+    assert len(table) == report.facts["rows"] == 300 * 3 + 30 * 2
     assert table["t_ns"].dtype == np.int64
     assert table["t_ns"].is_monotonic_increasing
     np.testing.assert_array_equal(table["time [s]"], (table["t_ns"] - T0) / 1e9)
@@ -211,7 +211,7 @@ def test_a_large_table_that_is_nearly_empty_is_refused(tmp_path, monkeypatch):
         offsets.write(T0, 1e-6 * np.arange(250))
         for k in range(4):
             states.write(T0 + k * 10_000_000, np.zeros(250))
-    assert export_wide(tmp_path / "run.mcap", tmp_path / "x.csv").rows == 1000
+    assert export_wide(tmp_path / "run.mcap", tmp_path / "x.csv").facts["rows"] == 1000
     monkeypatch.setattr("undulog.capture.exchange.wide_table._MOST_SPARSE", 10_000)
     with pytest.raises(UsageError, match=r"empty but for 0\.4% of its cells; choose columns"):
         export_wide(tmp_path / "run.mcap", tmp_path / "y.csv")
