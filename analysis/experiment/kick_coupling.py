@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
-from ..estimators.intervals import CONFIDENCE
+from ..estimators.intervals import CONFIDENCE, NoisyMatrix
 from ..results.coupling import (
     BaseResponse,
     Coupling,
@@ -35,7 +35,6 @@ from ..results.estimate import Estimate
 from .kick_runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .local_coupling import (
     LocalMatrices,
-    MeasuredDerivatives,
     ResponseMatrices,
     local_matrices,
     lti_reading,
@@ -312,7 +311,7 @@ def _held_out(
     )
 
 
-def _rows(names: Sequence[str], sums: MeasuredDerivatives, expected: float) -> tuple[RowCheck, ...]:
+def _rows(names: Sequence[str], sums: NoisyMatrix, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
     return tuple(
@@ -354,7 +353,7 @@ def _scatter(found: LocalMatrices) -> RunScatter:
     )
 
 
-def _matrix(matrix: MeasuredDerivatives) -> Matrix:
+def _matrix(matrix: NoisyMatrix) -> Matrix:
     return Matrix(
         rows_of(matrix.value),
         rows_of(matrix.error),

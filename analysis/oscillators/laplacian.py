@@ -34,7 +34,7 @@ from scipy.optimize import linear_sum_assignment
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws
+from ..estimators.intervals import CONFIDENCE, NoisyMatrix, noise_draws
 from ..results.coupling import rows_of
 from ..results.estimate import Estimate
 from ..results.oscillators import Levels
@@ -198,7 +198,7 @@ def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> Floa
     return values[..., -1].astype(np.float64)
 
 
-def pseudospectrum(P: Noisy) -> Levels:
+def pseudospectrum(P: NoisyMatrix) -> Levels:
     """Return the levels around all eigenvalues, and the level of the noise of P."""
     here = of_deviations(P.value)
     error = of_deviations(P.value + noise_draws(P, 21)) - here
