@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from support.linear_chain import asymmetry, within
-from undulog.analysis.experiment.kick_coupling import predict, valid_to
 from undulog.analysis.estimators.intervals import NoisyMatrix
+from undulog.analysis.experiment.kick_coupling import predict, valid_to
 from undulog.analysis.experiment.kick_runs import (
     Kick,
     Kind,
