@@ -81,7 +81,7 @@ def analyse_experiment(
     multisine = find_multisine(examined.periodic)
     if multisine is not None:
         return _of_multisine(multisine, examined)
-    kicks = find_kicks(runs, examined.gaits)
+    kicks = find_kicks(runs)
     sweep = find_sweep(examined.commanded) if kicks is None else None
     if sweep is not None:
         return _of_sweep(sweep, examined)
