@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
@@ -229,7 +229,6 @@ def _phase(fit: HarmonicFit, sideways: FloatArray, k: int, factor: float) -> Est
 
 ODOMETRY_TOPIC = "/odom"
 
-_NS = 1_000_000_000
 _CHILD = "child_frame_id"
 _POSE = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
@@ -321,8 +320,8 @@ def head_poses(
     Raises:
         DataError: If there are none, too few, of another link, or without an orientation.
     """
-    start_ns = span.origin_ns + round(span.start_s * _NS)
-    stop_ns = span.origin_ns + round(span.stop_s * _NS)
+    start_ns = span.origin_ns + round(span.start_s * NS)
+    stop_ns = span.origin_ns + round(span.stop_s * NS)
     _, tables = session.columns({}, {ODOMETRY_TOPIC: [_CHILD, *_POSE]})
     table = tables[ODOMETRY_TOPIC]
     at_ns: IntArray = table.index.to_numpy(dtype=np.int64)

@@ -66,8 +66,6 @@ from .fields import SessionMeasurement, gait_facts, joint_results
 from .heterogeneity import heterogeneity_indices
 from .runs import coupling_of_one_gait
 
-_NS = 1e9
-
 
 def _warn_flags(
     artefacts: Iterable[Artefact],
@@ -174,8 +172,8 @@ def measure_session(
     _warn_dropped(commands, responses, warn)
     session.forget()
     follows = following(session, columns, whole)
-    start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
-    held = unrefuted([one for one in artefacts if one.within(start_s, stop_s)], follows)
+    during = stretch.since(session.start_ns)
+    held = unrefuted([one for one in artefacts if one.within(*during)], follows)
     session.forget()
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
@@ -321,8 +319,7 @@ def _warn_dropped(
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
-    start_s = (stretch.start_ns - origin_ns) / _NS
-    stop_s = (stretch.stop_ns - origin_ns) / _NS
+    start_s, stop_s = stretch.since(origin_ns)
     if gait is None:
         return Span(origin_ns, start_s, stop_s, 0)
     first_s, stop_s, cycles = whole_cycles(start_s, stop_s, gait.fit.frequency_hz)
