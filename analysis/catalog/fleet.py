@@ -19,6 +19,7 @@ import pandas as pd
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import MissingExtraError
 
+from ..estimators.intervals import holm
 from ..results.estimate import Interval
 from .change_points import (
     LEAST_SESSIONS,
@@ -334,11 +335,9 @@ def _trends(sessions: _Frame) -> list[Trend]:
                     count,
                 )
             )
-    corrected, trends = 0.0, list[Trend]()
-    for rank, trend in enumerate(sorted(found, key=lambda trend: trend.p)):  # Holm (1979)
-        corrected = max(corrected, min(1.0, (len(found) - rank) * trend.p))
-        trends.append(replace(trend, p=corrected))
-    return trends
+    found.sort(key=lambda trend: trend.p)
+    adjusted = holm(np.array([trend.p for trend in found])).tolist()
+    return [replace(trend, p=p) for trend, p in zip(found, adjusted, strict=True)]
 
 
 def _covariates(sessions: _Frame) -> dict[str, FloatArray]:

@@ -13,7 +13,7 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 
-from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p
+from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p, holm
 from ..results import formats
 from ..results.comparison import (
     BODY,
@@ -24,7 +24,7 @@ from ..results.comparison import (
     of_body,
 )
 from ..results.estimate import Estimate, leaves_out_zero
-from .quantities import Differences, Key, Quantities, from_runs, holm, independent, paired
+from .quantities import Differences, Key, Quantities, from_runs, independent, paired
 from .side import ComparedSession
 
 SIGNIFICANT_DIFFERENCE = 0.05

@@ -129,7 +129,25 @@ def equivalence_p(
     return float(np.max(stdtr(dof, -score)))
 
 
+def holm(p: FloatArray) -> FloatArray:
+    """Return step-down p-values that hold for the whole family (Holm 1979).
+
+    Args:
+        p: Of each by itself, shape (k,).
+
+    Returns:
+        Adjusted, shape (k,).
+    """
+    order = np.argsort(p, kind="stable")
+    steps = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(steps, 1.0)
+    return adjusted
+
+
 CONFIDENCE = 0.95
+TAILS = ((1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2)
+"""Quantiles at the ends of an interval."""
 
 
 def welch_satterthwaite(variances: FloatArray, dof: FloatArray) -> FloatArray:

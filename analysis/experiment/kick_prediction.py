@@ -16,7 +16,7 @@ from scipy.linalg import expm
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
-from ..estimators.intervals import CONFIDENCE, NoisyMatrix, noise_draws
+from ..estimators.intervals import TAILS, NoisyMatrix, noise_draws
 from ..oscillators.laplacian import intervals_of, spectrum
 from ..oscillators.predictions import felt_response, measured, relaxation
 from ..results import formats
@@ -146,8 +146,7 @@ def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float)
         return np.stack(rows, axis=-2)
 
     here, there = followed(J), followed(drawn)
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(there, (tail, 1 - tail), axis=0)
+    low, high = np.quantile(there, TAILS, axis=0)
     return Relaxation(
         tuple(times.tolist()),
         rows_of(here),

@@ -38,7 +38,7 @@ from scipy.special import stdtridf, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..estimators.intervals import CONFIDENCE, NoisyMatrix, noise_draws
+from ..estimators.intervals import CONFIDENCE, TAILS, NoisyMatrix, noise_draws
 from ..results import formats
 from ..results.coupling import LocalCoupling, Matrix, rows_of
 from ..results.estimate import Estimate
@@ -232,8 +232,8 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> NoisyMatr
 def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     return tuple(
         Mode(
-            real=Estimate(float(rate.real), _pair(ends.real[k])),
-            imag=Estimate(float(rate.imag), _pair(ends.imag[k])),
+            real=Estimate(float(rate.real), tuple(ends.real[k].tolist())),
+            imag=Estimate(float(rate.imag), tuple(ends.imag[k].tolist())),
             sensitivity=float(found.sensitivity[k]),
             pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
             pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
@@ -249,9 +249,8 @@ def _explicit(P: NoisyMatrix) -> Estimate:
     draws = [explicit_coupling(P.value + one) for one in noise_draws(P, 41)[:EXPLICIT_DRAWS]]
     if None in draws:
         return Estimate(value)
-    tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(np.array(draws, dtype=np.float64), (tail, 1.0 - tail))
-    return Estimate(value, (min(value, float(low)), max(value, float(high))))
+    low, high = np.quantile(np.array(draws, dtype=np.float64), TAILS).tolist()
+    return Estimate(value, (min(value, low), max(value, high)))
 
 
 def _answer(found: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
@@ -278,7 +277,3 @@ def _pace(gap: Estimate) -> str:
         return f"relaxes at {formats.estimate(gap, ' eps', most=4)}"
     ends = None if gap.ci95 is None else (-gap.ci95[1], -gap.ci95[0])
     return f"grows at {formats.estimate(Estimate(-gap.value, ends), ' eps', most=4)}"
-
-
-def _pair(ends: FloatArray) -> tuple[float, float]:
-    return float(ends[0]), float(ends[1])

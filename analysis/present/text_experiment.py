@@ -102,10 +102,8 @@ def render_comparison(
         sheet.print(f"Partial: {comparison.partial}")
     sheet.print()
     sheet.lines(_changed(comparison.changed))
-    sheet.print()
     sheet.table(difference_table(comparison))
     if comparison.waveforms:
-        sheet.print()
         sheet.table(waveform_table(comparison))
     sheet.print()
     sheet.print(_equivalence(comparison))
@@ -161,7 +159,6 @@ def render_experiment(
     reversal = experiment.reversal
     if reversal is not None:
         sheet.lines(reversal_detail(reversal))
-        sheet.print()
         sheet.table(mirror_table(reversal))
     if isinstance(experiment.coupling, LocalCoupling):
         sheet.lines(kick_detail(experiment.coupling))
@@ -170,15 +167,12 @@ def render_experiment(
     if isinstance(experiment.coupling, LinearCoupling):
         sheet.lines(sweep_detail(experiment.coupling))
     if experiment.best_linear is not None:
-        sheet.print()
         sheet.table(best_linear_table(experiment.best_linear.joints))
     body = experiment.body_connection
     if body is not None and body.fitted:
         sheet.lines(connection_detail(body))
-        sheet.print()
         sheet.table(travel_table(body))
         sheet.lines(refusals(body))
-    sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
