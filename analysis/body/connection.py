@@ -389,10 +389,7 @@ def _condition(base: ShapeBase, perturbations: Sequence[ComplexArray]) -> float:
     rate = np.stack([wave_at(_rate(base.cycle + one), _GRID) for one in perturbations])
     known = wave_at(_rate(base.cycle), _GRID)[None] * len(perturbations) ** 0.5
     design = np.concatenate(
-        [
-            np.concatenate([rate, off], axis=1),
-            np.concatenate([np.zeros_like(known), known], axis=1),
-        ]
+        [np.concatenate([rate, off], axis=1), np.concatenate([np.zeros_like(known), known], axis=1)]
     )
     size = np.linalg.svd(design.transpose(2, 0, 1), compute_uv=False)
     if size.shape[1] < design.shape[1] or not (size[:, -1] > 0).all():

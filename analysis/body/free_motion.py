@@ -144,10 +144,7 @@ class PhaseLine:
 
 
 def phase_line(
-    motion: Oscillation,
-    index: FloatArray,
-    place: FloatArray,
-    near_rad: FloatArray | None = None,
+    motion: Oscillation, index: FloatArray, place: FloatArray, near_rad: FloatArray | None = None
 ) -> PhaseLine:
     """Fit a line to the phases.
 

@@ -179,12 +179,7 @@ def cycle_loads(
 
 
 def ground_contact(
-    session: SessionView,
-    columns: Columns,
-    angles: Mapping[str, Series],
-    *,
-    span: Span,
-    warn: Warn,
+    session: SessionView, columns: Columns, angles: Mapping[str, Series], *, span: Span, warn: Warn
 ) -> GroundContact | None:
     """Find which links are on the ground, cycle by cycle.
 

@@ -27,14 +27,7 @@ from ..results.body import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMo
 from ..results.estimate import Estimate
 from ..signals.columns import by_plane
 from ..signals.windows import Span
-from .free_motion import (
-    MotionFit,
-    Oscillation,
-    absolute,
-    best_lag,
-    fit_motion,
-    wave_speed,
-)
+from .free_motion import MotionFit, Oscillation, absolute, best_lag, fit_motion, wave_speed
 from .motion import ODOMETRY_TOPIC, head_poses
 from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles
 

@@ -238,9 +238,7 @@ def virtual_chassis(centres: FloatArray) -> tuple[ComplexArray, FloatArray, Floa
 
 
 def chassis_path(
-    robot: Robot,
-    poses: tuple[FloatArray, FloatArray, FloatArray],
-    angles: Mapping[str, Series],
+    robot: Robot, poses: tuple[FloatArray, FloatArray, FloatArray], angles: Mapping[str, Series]
 ) -> ChassisPath:
     """Follow the virtual chassis.
 

@@ -21,12 +21,7 @@ from undulog.capture.common.errors import MissingExtraError
 
 from ..estimators.intervals import holm
 from ..results.estimate import Interval
-from .change_points import (
-    LEAST_SESSIONS,
-    LEVEL,
-    find_change_points,
-    relative_to_others,
-)
+from .change_points import LEAST_SESSIONS, LEVEL, find_change_points, relative_to_others
 
 _Frame: TypeAlias = Any  # pandas.DataFrame; its stubs don't know the columns' types
 

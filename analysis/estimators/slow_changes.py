@@ -353,10 +353,7 @@ def _halves(gains: _Fits, lags: _Fits) -> tuple[_Fits, _Fits]:
 
 
 def _zoomed(
-    shapes: Shapes,
-    series: FloatArray,
-    place: FloatArray,
-    noises: Sequence[_Noise],
+    shapes: Shapes, series: FloatArray, place: FloatArray, noises: Sequence[_Noise]
 ) -> Shapes:
     """Return transients on a grid as fine as the likelihood is narrow."""
     lowest, highest = float(shapes.tau.min()), shapes.longest

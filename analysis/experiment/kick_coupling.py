@@ -280,10 +280,7 @@ def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
 
 
 def _held_out(
-    experiment: KickExperiment,
-    change: ComplexArray,
-    base: ComplexArray,
-    found: LocalMatrices,
+    experiment: KickExperiment, change: ComplexArray, base: ComplexArray, found: LocalMatrices
 ) -> tuple[HeldOut, ...]:
     """Predict the held-out runs."""
     G, S = found.G, found.S
@@ -299,12 +296,7 @@ def _held_out(
     deviation = experiment.runs.deviation
     return tuple(
         predict(
-            deviation[k],
-            change[k],
-            variance[k],
-            response,
-            matrices,
-            session=experiment.labels[k],
+            deviation[k], change[k], variance[k], response, matrices, session=experiment.labels[k]
         )
         for k in experiment.runs.patterns
         if np.isfinite(change[k]).all()

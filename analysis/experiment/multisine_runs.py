@@ -281,10 +281,7 @@ def _spectra(
 
 
 def _steady_periods(
-    design: MultisineDesign,
-    commands: Sequence[Series],
-    limits: tuple[float, float],
-    length: int,
+    design: MultisineDesign, commands: Sequence[Series], limits: tuple[float, float], length: int
 ) -> tuple[float, int]:
     """Find the last time at which most periods end that repeat one another.
 

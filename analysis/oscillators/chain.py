@@ -241,10 +241,7 @@ _ADAPTIVE = {
 
 
 def closed_loop(
-    session: SessionView,
-    options: Options,
-    responses: Sequence[JointFrequencyResponse],
-    warn: Warn,
+    session: SessionView, options: Options, responses: Sequence[JointFrequencyResponse], warn: Warn
 ) -> str | None:
     """Find what makes the commands depend on measured motion, and warn of its bias.
 

@@ -321,11 +321,7 @@ def _equations(
     means = _period_means(x).reshape(count, length, -1)
     steps = np.diff(phases[:, target]).reshape(count, length)
     weight = test / length
-    return (
-        np.einsum("l,wlc->wc", weight, means),
-        x[:-1:length],
-        steps @ weight / period_s,
-    )
+    return (np.einsum("l,wlc->wc", weight, means), x[:-1:length], steps @ weight / period_s)
 
 
 def _period_means(x: FloatArray) -> FloatArray:

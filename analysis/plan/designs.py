@@ -46,12 +46,7 @@ HIGHEST_HZ = RATE_HZ / 8
 
 
 def phase_kicks(
-    names: tuple[str, ...],
-    amplitude: ComplexArray,
-    repeats: int,
-    *,
-    kick: float,
-    base_runs: int,
+    names: tuple[str, ...], amplitude: ComplexArray, repeats: int, *, kick: float, base_runs: int
 ) -> tuple[PlannedRun, ...]:
     """Plan runs of the gait, four kicks of each joint, and held-out patterns.
 

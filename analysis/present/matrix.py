@@ -251,10 +251,7 @@ def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup
     sign = "plus" if value >= 0 else "minus"
     edge = 0.5 if box.side > 12 else 0.0
     side = box.side - 2 * edge
-    kind = {
-        "class_": f"{sign}{' own' if i == j else ''}",
-        "style": f"--v:{100 * level:.0f}%",
-    }
+    kind = {"class_": f"{sign}{' own' if i == j else ''}", "style": f"--v:{100 * level:.0f}%"}
     parts = [element("rect", x=box.x + edge, y=box.y + edge, width=side, height=side, **kind)]
     if value < 0 and level > 0.08:
         x, y = box.middle

@@ -20,12 +20,7 @@ from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
 from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
-from ..energy import (
-    check_ledger,
-    energy_result,
-    joint_energies,
-    transport,
-)
+from ..energy import check_ledger, energy_result, joint_energies, transport
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
@@ -33,22 +28,12 @@ from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
-from ..results.analysis import (
-    Analysis,
-    JointResult,
-    SessionFacts,
-)
+from ..results.analysis import Analysis, JointResult, SessionFacts
 from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
-from ..segments.session import (
-    compare_joints,
-    following,
-    not_following,
-    stopped,
-    unrefuted,
-)
+from ..segments.session import compare_joints, following, not_following, stopped, unrefuted
 from ..signals.artefacts import find_artefacts
 from ..signals.columns import drag_ratio, read_columns
 from ..signals.stretch import (
@@ -68,10 +53,7 @@ from .runs import coupling_of_one_gait
 
 
 def _warn_flags(
-    artefacts: Iterable[Artefact],
-    joints: tuple[JointResult, ...],
-    gait: GaitFit | None,
-    warn: Warn,
+    artefacts: Iterable[Artefact], joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn
 ) -> None:
     """Warn of each kind of artefact with its joints, and of responses lost in noise."""
     joined: dict[tuple[str, str, str], list[Artefact]] = {}
@@ -190,8 +172,7 @@ def measure_session(
         ()
         if gait is not None
         else frequency_responses(
-            *(commands, sound, warn),
-            _series(columns.names, columns.excitation, stretch, origin_ns),
+            *(commands, sound, warn), _series(columns.names, columns.excitation, stretch, origin_ns)
         )
     )
     del commands
@@ -220,12 +201,7 @@ def measure_session(
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     commanded = columns.commanded()
     findings = compare_joints(
-        session.robot,
-        gait,
-        joints,
-        faulty=faulty,
-        commanded=commanded,
-        offsets=follows.offsets,
+        session.robot, gait, joints, faulty=faulty, commanded=commanded, offsets=follows.offsets
     )
     shape = body_shape(session, responses, sound, gait, span=span, warn=warn)
     analysis = Analysis(

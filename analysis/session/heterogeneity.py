@@ -105,10 +105,7 @@ class Spread:
 
 
 def index(
-    name: str,
-    value: float | None = None,
-    ci95: Interval | None = None,
-    p: float | None = None,
+    name: str, value: float | None = None, ci95: Interval | None = None, p: float | None = None
 ) -> Index:
     """Return an index of one of ``KINDS`` with its unit and label."""
     return Index(value, ci95, p, *KINDS[name])
