@@ -23,8 +23,10 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.harmonic import HarmonicModel, fit_at
+from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
 from ..response.rhythm import NYQUIST_SHARE
+from ..results.estimate import Estimate
 from ..signals.windows import Span
 from .motion import ODOMETRY_TOPIC, head_poses, link_centres
 from .null import SAMPLES, travel
@@ -136,6 +138,21 @@ def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
         return None
     count = per_cycle.size
     return float(per_cycle.mean()), float(per_cycle.var(ddof=1) / count), count - 1.0
+
+
+def mean_step(steps: FloatArray, least: float = -np.inf, most: float = np.inf) -> Estimate:
+    """Return the mean of a quantity of each cycle, its interval from their scatter.
+
+    Args:
+        least: Where the interval ends at the latest.
+        most: The same of its other end.
+    """
+    known = mean_of_cycles(steps)
+    if known is None:
+        return Estimate(float(steps.mean()) if steps.size else None)
+    value, variance, dof = known
+    low, high = around(value, t_factor(dof) * variance**0.5)
+    return Estimate(value, (max(least, low), min(most, high)))
 
 
 def speed(steps: Steps) -> tuple[float, float, float] | None:

@@ -18,6 +18,7 @@ from ..compare.decisions import (
     WORDS,
     decimals_of,
     in_people_units,
+    people_unit,
     signed,
     signed_difference,
 )
@@ -411,8 +412,7 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
 
 def _side(one: Difference, value: float) -> str:
     """Return the value of a side, with the digits and the unit of both."""
-    factor = math.degrees(1) if one.unit in ("rad", "rad/joint") else 1.0
-    unit = {"rad": "°", "rad/joint": "°/joint", "1": ""}.get(one.unit, f" {one.unit}")
+    factor, unit = people_unit(one.unit)
     digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
     return formats.number(value * factor, digits) + unit
 
