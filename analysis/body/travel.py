@@ -28,7 +28,7 @@ from ..estimators.series import Series
 from ..response.rhythm import NYQUIST_SHARE
 from ..results.estimate import Estimate
 from ..signals.windows import Span
-from .motion import ODOMETRY_TOPIC, head_poses, link_centres
+from .motion import ODOMETRY_TOPIC, Poses, head_poses, link_centres
 from .null import SAMPLES, travel
 
 GRAVITY = 9.80665
@@ -91,18 +91,13 @@ def body_steps(
     return Steps(step @ way, cycle_s, sum(link.mass for link in robot.links))
 
 
-def centre_of_mass(
-    robot: Robot,
-    t_s: FloatArray,
-    poses: tuple[FloatArray, FloatArray, FloatArray],
-    angles: FloatArray,
-) -> FloatArray:
+def centre_of_mass(robot: Robot, t_s: FloatArray, poses: Poses, angles: FloatArray) -> FloatArray:
     """Return the centre of mass from the head's pose and the joint angles.
 
     Args:
         robot: The robot, m joints.
         t_s: Times wanted [s], shape (n,).
-        poses: Times [s], positions [m] and quaternions of the head; interpolated.
+        poses: Of the head; interpolated.
         angles: Joint angles at the wanted times [rad], shape (n, m).
 
     Returns:
@@ -254,13 +249,11 @@ def virtual_chassis(centres: FloatArray) -> tuple[ComplexArray, FloatArray, Floa
     return origin, np.angle(axis), np.sqrt(np.maximum(squares, 0.0))
 
 
-def chassis_path(
-    robot: Robot, poses: tuple[FloatArray, FloatArray, FloatArray], angles: Mapping[str, Series]
-) -> ChassisPath:
+def chassis_path(robot: Robot, poses: Poses, angles: Mapping[str, Series]) -> ChassisPath:
     """Follow the virtual chassis.
 
     Args:
-        poses: Times [s], positions [m] and quaternions of the head.
+        poses: Of the head.
         angles: Of every joint.
 
     Raises:
@@ -268,7 +261,7 @@ def chassis_path(
     """
     parts = [
         (t_s, *virtual_chassis(centres[..., :2]))
-        for t_s, centres in link_centres(robot, *poses, [angles[n] for n in robot.joint_names])
+        for t_s, centres in link_centres(robot, poses, [angles[n] for n in robot.joint_names])
     ]
     if not parts:
         raise DataError("the head's poses and the joint angles have no common time")

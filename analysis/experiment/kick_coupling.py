@@ -346,9 +346,5 @@ def _scatter(found: LocalMatrices) -> RunScatter:
 
 
 def _matrix(matrix: NoisyMatrix) -> Matrix:
-    return Matrix(
-        rows_of(matrix.value),
-        rows_of(matrix.error),
-        rows_of(matrix.half),
-        rows_of(matrix.half_together),
-    )
+    parts = matrix.value, matrix.error, matrix.half, matrix.half_together
+    return Matrix(*map(rows_of, parts))

@@ -74,13 +74,8 @@ class ResponseMatrices:
     def select(self, chosen: Sequence[int]) -> ResponseMatrices:
         """Return some of the runs."""
         index = list(chosen)
-        return ResponseMatrices(
-            self.log[index],
-            self.log_gain_variance[index],
-            self.phase_variance[index],
-            self.dof[index],
-            self.errors,
-        )
+        every = self.log, self.log_gain_variance, self.phase_variance, self.dof
+        return ResponseMatrices(*(one[index] for one in every), self.errors)
 
 
 def central_differences(

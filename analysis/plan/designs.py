@@ -117,14 +117,8 @@ def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
     """
     random = np.random.default_rng(1)
     order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
-    return tuple(
-        PlannedRun(
-            f"lag{k:02d}",
-            amplitude * dft(m)[k],
-            {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"},
-        )
-        for k in order
-    )
+    facts = [{"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"} for k in range(m)]
+    return tuple(PlannedRun(f"lag{k:02d}", amplitude * dft(m)[k], facts[k]) for k in order)
 
 
 def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tuple[PlannedRun, ...]:
