@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
-from ..estimators.intervals import CONFIDENCE, NoisyMatrix
+from ..estimators.intervals import CONFIDENCE, NoisyMatrix, around
 from ..results.coupling import (
     BaseResponse,
     Coupling,
@@ -306,14 +306,10 @@ def _held_out(
 def _rows(names: Sequence[str], sums: NoisyMatrix, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
+    numbers = (one.tolist() for one in (sums.value, half, sums.error))
     return tuple(
-        RowCheck(
-            name,
-            expected,
-            Estimate(float(total), (float(total - wide), float(total + wide))),
-            float(error),
-        )
-        for name, total, wide, error in zip(names, sums.value, half, sums.error, strict=True)
+        RowCheck(name, expected, Estimate(total, around(total, wide)), error)
+        for name, total, wide, error in zip(names, *numbers, strict=True)
     )
 
 

@@ -60,7 +60,7 @@ def gait_facts(
     window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
     if gait is None:
         return GaitFacts(Estimate(), (window,))
-    groups = _group_facts(session.robot, gait, span, stretch, session.start_ns)
+    groups = _group_facts(session.robot, gait, window, stretch, session.start_ns)
     return GaitFacts(
         frequency_hz=groups[0].frequency_hz,
         windows=(window,),
@@ -72,22 +72,19 @@ def gait_facts(
 
 
 def _group_facts(
-    robot: Robot | None, gait: GaitFit, span: Span, stretch: Stretch, start_ns: int
+    robot: Robot | None, gait: GaitFit, window: Window, stretch: Stretch, start_ns: int
 ) -> tuple[GroupFacts, ...]:
     """Return frequency, whole cycles and wave of each group, the largest first.
 
     Args:
-        span: The largest group's whole cycles.
+        window: The largest group's whole cycles.
         start_ns: Unix time of the session's start [ns].
     """
-    shift_s = (span.origin_ns - start_ns) / NS
     result: list[GroupFacts] = []
     for index, group in enumerate(gait.groups):
         frequency = group.fit.frequency_hz
         half = t_factor(group.omega_dof) * group.omega_error / (2 * np.pi)
-        if index == 0:
-            window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
-        else:
+        if index > 0:
             first_s, last_s, cycles = whole_cycles(*stretch.since(start_ns), frequency)
             window = Window(first_s, last_s, float(cycles))
         wave, steps = _wave(robot, group)
