@@ -74,8 +74,8 @@ class ResponseMatrices:
     def select(self, chosen: Sequence[int]) -> ResponseMatrices:
         """Return some of the runs."""
         index = list(chosen)
-        every = self.log, self.log_gain_variance, self.phase_variance, self.dof
-        return ResponseMatrices(*(one[index] for one in every), self.errors)
+        numbers = ("log", "log_gain_variance", "phase_variance", "dof")
+        return replace(self, **{name: getattr(self, name)[index] for name in numbers})
 
 
 def central_differences(

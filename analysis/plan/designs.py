@@ -116,7 +116,7 @@ def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
         m runs a repeat, in random order so that warming up looks like no lag.
     """
     random = np.random.default_rng(1)
-    order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
+    order: list[int] = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
     facts = [{"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"} for k in range(m)]
     return tuple(PlannedRun(f"lag{k:02d}", amplitude * dft(m)[k], facts[k]) for k in order)
 
