@@ -132,9 +132,14 @@ def _p(p: float | None) -> PValue | None:
     return None if p is None else PValue(p)
 
 
-def typical(most: int) -> Callable[[Sequence[Estimate]], int]:
-    """Return the digits that the typical interval of the column deserves."""
-    return partial(formats.decimals_for, most=most)
+def typical(text: int, page: int) -> tuple[Digits, Digits]:
+    """Return the digits that the typical interval of the column deserves, at most so many.
+
+    Args:
+        text: On a terminal.
+        page: On the page.
+    """
+    return partial(formats.decimals_for, most=text), partial(formats.decimals_for, most=page)
 
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
@@ -160,15 +165,16 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
     def distortion(one: JointFrequencyResponse) -> Estimate:
         return scaled(Estimate(one.distortion), 100.0)
 
-    gain, delay = (typical(4), typical(4)), (typical(2), typical(3))
     columns: list[Column[JointFrequencyResponse]] = [
         Column("joint", "joint", lambda one: one.joint, kind="word"),
         Column("command", "command", excitation, kind="word", spare=2),
         Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
         Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
-        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, gain),
+        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, typical(4, 4)),
         Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
-        Column("delay ms (95 %)", "delay [ms]", lambda one: scaled(one.delay_s, 1e3), delay),
+        Column(
+            "delay ms (95 %)", "delay [ms]", lambda one: scaled(one.delay_s, 1e3), typical(2, 3)
+        ),
         Column("is", "delay is", model, kind="word", spare=4),
         Column("distortion %", "distortion [%]", distortion, (2, 2), spare=3),
         Column("halves agree", "halves agree", agree, kind="word", spare=1),
@@ -184,7 +190,7 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
 def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
     """Return amplitude, offset and lag of joints that move without commands."""
     with_planes = any(one.plane for one in found)
-    angle, lag = (typical(2), typical(4)), "lag behind the one before"
+    angle, lag = typical(2, 4), "lag behind the one before"
     columns: list[Column[JointMotion]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
@@ -208,7 +214,7 @@ def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
         return math.degrees(one.deviation_rad)
 
     with_planes = any(one.plane for one in found)
-    angle, speed, share = ((typical(few), typical(more)) for few, more in ((2, 4), (2, 3), (3, 4)))
+    angle, share = typical(2, 4), typical(3, 4)
     columns: list[Column[BodyWave]] = [
         *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
         Column("wave", "wave", way, kind="word"),
@@ -216,7 +222,7 @@ def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
             "°/joint (95 %)", "wave number [°/joint]", lambda one: degrees(one.wave_number), angle
         ),
         Column("waves (95 %)", "waves", lambda one: one.waves, share),
-        Column("joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, speed),
+        Column("joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, typical(2, 3)),
         Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, share, spare=1),
         Column(
             "travelling (95 %)", "travelling index [1]", lambda one: one.travelling_index, share
@@ -257,8 +263,8 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
         Column("plane", "plane", lambda j: j.plane, kind="word", spare=1),
         *([frequency] if len(analysis.gait.groups) > 1 else []),
         Column("command°", "command [°]", command, (1, 2), spare=5),
-        Column("gain (95 %)", "gain [1]", lambda j: j.gain, (typical(4), typical(4))),
-        Column("lag° (95 %)", "lag [°]", lambda j: degrees(j.lag_rad), (typical(2), typical(3))),
+        Column("gain (95 %)", "gain [1]", lambda j: j.gain, typical(4, 4)),
+        Column("lag° (95 %)", "lag [°]", lambda j: degrees(j.lag_rad), typical(2, 3)),
         *(
             Column[JointResult](f"{name} J", None, of, (_significant(3), 0), spare=spare)
             for name, _, of, spare in _ENERGIES
@@ -358,7 +364,7 @@ def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
 
 def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
     """Each joint against its mirror joint."""
-    relative, most = formats.relative, (typical(3), typical(5))
+    relative, most = formats.relative, typical(3, 5)
     columns: list[Column[MirrorJoint]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         Column("its mirror", "its mirror", lambda one: one.mirror, kind="word", spare=1),

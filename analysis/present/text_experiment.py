@@ -42,13 +42,11 @@ def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint
         known = one.noise_sd is not None and gain > 0
         return Estimate(100 * math.hypot(*one.noise_sd or ()) / gain if known else None)
 
-    gain, delay = (typical(4), typical(4)), (typical(2), typical(3))
-
     def share(name: str, spare: int = 0) -> Column[BestLinearJoint]:
         def percent(one: BestLinearJoint) -> Estimate:
             return scaled(getattr(one, name), 100.0)
 
-        return Column(f"{name} % (95 %)", f"{name} [%]", percent, delay, spare=spare)
+        return Column(f"{name} % (95 %)", f"{name} [%]", percent, typical(2, 3), spare=spare)
 
     def lowest(one: BestLinearJoint) -> Estimate:
         return Estimate(one.response.gain[0], one.response.gain_ci95[0])
@@ -60,9 +58,9 @@ def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint
         Column("joint", "joint", lambda one: one.response.joint, kind="word"),
         Column("from Hz", "from [Hz]", lambda one: one.response.frequency_hz[0], (3, 4), spare=6),
         Column("to Hz", "to [Hz]", lambda one: one.response.frequency_hz[-1], (2, 3), spare=6),
-        Column("gain there (95 %)", "gain at the lowest [1]", lowest, gain, spare=1),
+        Column("gain there (95 %)", "gain at the lowest [1]", lowest, typical(4, 4), spare=1),
         Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.response.bandwidth_hz), (2, 3)),
-        Column("delay ms (95 %)", "delay [ms]", delay_ms, delay, spare=2),
+        Column("delay ms (95 %)", "delay [ms]", delay_ms, typical(2, 3), spare=2),
         Column("noise %", "noise [%]", noise, (2, 3), spare=3),
         share("distortion"),
         share("odd", spare=5),
@@ -316,8 +314,10 @@ def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
     def column(
         name: str, unit: str, of: Callable[[PredictedTravel], Estimate], spare: int = 0
     ) -> Column[PredictedTravel]:
-        shown = typical(1 if unit == "mm" else 2)  # what a camera tells apart
-        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, (shown, shown), spare=spare)
+        most = 1 if unit == "mm" else 2  # what a camera tells apart
+        return Column(
+            f"{name} {unit} (95 %)", f"{name} [{unit}]", of, typical(most, most), spare=spare
+        )
 
     def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
         return lambda one: formats.scaled(of(one), 1000.0)
