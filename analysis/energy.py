@@ -405,13 +405,9 @@ def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
     """
     joints = list(energies)
     sums: dict[str, float] = {}
-    for kind, names in (
-        ("mechanical", ("net", "plus", "abs")),
-        ("electrical", ("el", "el_clipped", "el_abs")),
-    ):
+    for name, (kind, part, _) in {**TERMS, "el_abs": ("electrical", "abs_j", "")}.items():
         if known := [one for joint in joints if (one := getattr(joint, kind)) is not None]:
-            for name, part in zip(names, ("net_j", "plus_j", "abs_j"), strict=True):
-                sums[name] = sum(float(getattr(one, part).sum()) for one in known)
+            sums[name] = sum(float(getattr(one, part).sum()) for one in known)
     return sums
 
 

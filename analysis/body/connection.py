@@ -122,7 +122,6 @@ class Connection:
         most_hidden: Root mean square part of the gaits in them, the largest of all [rad].
         dof: Degrees of freedom of all errors.
         spread: Standard deviation of a gait's step that the model leaves, shape (3,).
-        left_out: Steps of the gaits, each predicted from the others, shape (g, 3).
     """
 
     base: ShapeBase
@@ -134,7 +133,6 @@ class Connection:
     most_hidden: float
     dof: float
     spread: FloatArray
-    left_out: FloatArray
 
     def matrices(self, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return A and the half width of its 95 % interval, each of shape (n, 3, k)."""
@@ -327,7 +325,6 @@ def _fitted(
         most_hidden=float(np.max(_length(rows @ hidden))),
         dof=float(max(count - 2 * k, 1)),
         spread=frozen(np.sqrt(scaled.mean(axis=0))),
-        left_out=frozen(alone),
     )
 
 
@@ -389,10 +386,7 @@ def _condition(base: ShapeBase, perturbations: Sequence[ComplexArray]) -> float:
     rate = np.stack([wave_at(_rate(base.cycle + one), _GRID) for one in perturbations])
     known = wave_at(_rate(base.cycle), _GRID)[None] * len(perturbations) ** 0.5
     design = np.concatenate(
-        [
-            np.concatenate([rate, off], axis=1),
-            np.concatenate([np.zeros_like(known), known], axis=1),
-        ]
+        [np.concatenate([rate, off], axis=1), np.concatenate([np.zeros_like(known), known], axis=1)]
     )
     size = np.linalg.svd(design.transpose(2, 0, 1), compute_uv=False)
     if size.shape[1] < design.shape[1] or not (size[:, -1] > 0).all():

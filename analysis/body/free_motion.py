@@ -56,12 +56,8 @@ class Oscillation:
 
     def select(self, index: IntArray) -> Oscillation:
         """Return some of the joints, in the order of their indices."""
-        return Oscillation(
-            self.amplitudes[index],
-            self.bins.select(index),
-            self.mean_time_s[index],
-            self.omega_variance,
-        )
+        parts = self.amplitudes[index], self.bins.select(index), self.mean_time_s[index]
+        return Oscillation(*parts, self.omega_variance)
 
     def covariance(self, factors: ComplexArray) -> FloatArray:
         """Return the covariance of p numbers Re sum_k factor_k da_k, da_k the amplitudes' errors.
@@ -144,10 +140,7 @@ class PhaseLine:
 
 
 def phase_line(
-    motion: Oscillation,
-    index: FloatArray,
-    place: FloatArray,
-    near_rad: FloatArray | None = None,
+    motion: Oscillation, index: FloatArray, place: FloatArray, near_rad: FloatArray | None = None
 ) -> PhaseLine:
     """Fit a line to the phases.
 

@@ -25,16 +25,14 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
-from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, clean
 from ..results.answer import Note
 from ..results.body import GroundContact, LinkContact
-from ..results.estimate import Estimate
 from ..signals.columns import Columns
 from ..signals.stretch import SharedTimes, part_of
 from ..signals.windows import Span
 from .motion import ODOMETRY_TOPIC, head_poses
-from .travel import GRAVITY, MIN_CYCLES, mean_of_cycles
+from .travel import GRAVITY, MIN_CYCLES, mean_step
 
 PHASES = 32
 """Parts of a cycle, over each of which angles and torques are averaged."""
@@ -179,12 +177,7 @@ def cycle_loads(
 
 
 def ground_contact(
-    session: SessionView,
-    columns: Columns,
-    angles: Mapping[str, Series],
-    *,
-    span: Span,
-    warn: Warn,
+    session: SessionView, columns: Columns, angles: Mapping[str, Series], *, span: Span, warn: Warn
 ) -> GroundContact | None:
     """Find which links are on the ground, cycle by cycle.
 
@@ -281,11 +274,7 @@ def _links(robot: Robot, loads: FloatArray) -> tuple[LinkContact, ...]:
     touching = loads >= TOUCHES
     found: list[LinkContact] = []
     for k, link in enumerate(robot.links):
-        share = Estimate()
-        if (mean := mean_of_cycles(touching[..., k].mean(axis=1))) is not None:
-            value, variance, dof = mean
-            low, high = around(value, t_factor(dof) * variance**0.5)
-            share = Estimate(value, (max(0.0, low), min(1.0, high)))
+        share = mean_step(touching[..., k].mean(axis=1), 0.0, 1.0)
         by_phase = tuple(touching[..., k].mean(axis=0).tolist())
         found.append(LinkContact(link.name, share, float(loads[..., k].mean()), by_phase))
     return tuple(found)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
@@ -58,20 +59,25 @@ def place_links(count: int) -> tuple[int, int, int]:
     return 0, (count - 1) // 2, count - 1
 
 
-def track(
-    robot: Robot,
-    t_s: FloatArray,
-    head_position: FloatArray,
-    head_quaternion: FloatArray,
-    angles: Sequence[Series],
-) -> Track:
-    """Follow three links from the head's pose and the joint angles.
+class Poses(NamedTuple):
+    """Poses of the head.
+
+    Attributes:
+        t_s: Times [s], shape (n,).
+        position: [m], shape (n, 3).
+        quaternion: Unit quaternions x, y, z, w, shape (n, 4).
+    """
+
+    t_s: FloatArray
+    position: FloatArray
+    quaternion: FloatArray
+
+
+def track(robot: Robot, poses: Poses, angles: Sequence[Series]) -> Track:
+    """Follow three links from the head's poses and the joint angles.
 
     Args:
         robot: The robot, m joints.
-        t_s: Times of the poses [s], shape (n,).
-        head_position: [m], shape (n, 3).
-        head_quaternion: x, y, z, w, shape (n, 4).
         angles: Measured angle of every joint, in chain order, m of them; interpolated linearly to
             the times of the poses.
 
@@ -82,7 +88,7 @@ def track(
     times: list[FloatArray] = []
     places: list[FloatArray] = []
     chord = np.zeros(3)
-    for at_s, centres in link_centres(robot, t_s, head_position, head_quaternion, angles):
+    for at_s, centres in link_centres(robot, poses, angles):
         times.append(at_s)
         places.append(centres[:, chosen])
         chord += np.sum(centres[:, 0] - centres[:, -1], axis=0)
@@ -95,31 +101,25 @@ def track(
 
 
 def link_centres(
-    robot: Robot,
-    t_s: FloatArray,
-    head_position: FloatArray,
-    head_quaternion: FloatArray,
-    angles: Sequence[Series],
+    robot: Robot, poses: Poses, angles: Sequence[Series]
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield times and link centres, chunk by chunk.
 
     Args:
-        t_s: Times of the head's poses [s], shape (n,).
-        head_position: [m], shape (n, 3).
-        head_quaternion: x, y, z, w, shape (n, 4).
         angles: Measured angle of every joint, in chain order; interpolated linearly.
 
     Yields:
         Times that all joints cover [s], shape (k,), and centres [m], shape (k, links, 3).
     """
+    t_s, position, quaternion = poses
     start = max([float(t_s[0]), *(float(one.t_s[0]) for one in angles)])
     stop = min([float(t_s[-1]), *(float(one.t_s[-1]) for one in angles)])
     inside = np.flatnonzero((t_s >= start) & (t_s <= stop))
     for first in range(0, inside.size, _CHUNK):
         rows = inside[first : first + _CHUNK]
         shape = np.stack([one.at(t_s[rows]) for one in angles], axis=-1)
-        rotation = rotation_from_quaternion(head_quaternion[rows])
-        centres, _ = link_poses(robot, head_position[rows], rotation, shape)
+        rotation = rotation_from_quaternion(quaternion[rows])
+        centres, _ = link_poses(robot, position[rows], rotation, shape)
         yield t_s[rows], centres
 
 
@@ -197,15 +197,11 @@ def perfect_tracking(
         across = np.imag(path * np.conj(heading) / np.abs(heading))
         t_s = np.linspace(0.0, 2 * np.pi * cycles / omega, path.shape[0], endpoint=False)
         series = [Series(place, t_s, across[:, k]) for k, place in enumerate(PLACES)]
-        fit = fit_at(series, omega, HarmonicModel(harmonics=3, trend=TREND))
+        waves = fit_at(series, omega, HarmonicModel(harmonics=3, trend=TREND)).fundamental
+        sizes = np.abs(waves).tolist()
         result[name] = tuple(
-            BodyPoint(
-                place,
-                robot.links[links[k]].name,
-                Estimate(float(np.abs(fit.fundamental[k]))),
-                Estimate(_angle(fit.fundamental, k)),
-            )
-            for k, place in enumerate(PLACES)
+            BodyPoint(place, robot.links[link].name, Estimate(size), Estimate(_angle(waves, k)))
+            for k, (place, link, size) in enumerate(zip(PLACES, links, sizes, strict=True))
         )
     return result
 
@@ -229,7 +225,6 @@ def _phase(fit: HarmonicFit, sideways: FloatArray, k: int, factor: float) -> Est
 
 ODOMETRY_TOPIC = "/odom"
 
-_NS = 1_000_000_000
 _CHILD = "child_frame_id"
 _POSE = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
@@ -260,7 +255,7 @@ def body_motion(
     try:
         robot, fitted, plane = _fit_for_null(session, responses, gait)
         poses = head_poses(session, robot.links[0].name, span)
-        seen = track(robot, *poses, [responses[name] for name in robot.joint_names])
+        seen = track(robot, poses, [responses[name] for name in robot.joint_names])
         fit = fitted.fit
         commands = {
             robot.joint_names.index(name): (fit.amplitudes[k], float(fit.trend[k, 0]))
@@ -306,23 +301,20 @@ def _fit_for_null(
     return robot, gait, Plane(next(iter(planes)))
 
 
-def head_poses(
-    session: SessionView, head: str, span: Span
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def head_poses(session: SessionView, head: str, span: Span) -> Poses:
     """Return the head's poses within a window.
 
     Args:
         head: Name of the head link.
 
     Returns:
-        Times from the window's origin [s], shape (n,), positions [m], shape (n, 3), and unit
-        quaternions x, y, z, w, shape (n, 4).
+        The poses, their times from the window's origin.
 
     Raises:
         DataError: If there are none, too few, of another link, or without an orientation.
     """
-    start_ns = span.origin_ns + round(span.start_s * _NS)
-    stop_ns = span.origin_ns + round(span.stop_s * _NS)
+    start_ns = span.origin_ns + round(span.start_s * NS)
+    stop_ns = span.origin_ns + round(span.stop_s * NS)
     _, tables = session.columns({}, {ODOMETRY_TOPIC: [_CHILD, *_POSE]})
     table = tables[ODOMETRY_TOPIC]
     at_ns: IntArray = table.index.to_numpy(dtype=np.int64)
@@ -347,4 +339,4 @@ def head_poses(
     if np.any(length < 0.5):
         raise DataError(f"{ODOMETRY_TOPIC} holds orientations that are not unit quaternions")
     t_s = (t_ns - span.origin_ns).astype(np.float64) * 1e-9
-    return t_s, pose[:3].T, (pose[3:] / length).T
+    return Poses(t_s, pose[:3].T, (pose[3:] / length).T)

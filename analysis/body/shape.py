@@ -25,18 +25,12 @@ from ..response.fitting import GaitFit
 from ..results.answer import Note
 from ..results.body import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
 from ..results.estimate import Estimate
+from ..results.formats import scaled
 from ..signals.columns import by_plane
 from ..signals.windows import Span
-from .free_motion import (
-    MotionFit,
-    Oscillation,
-    absolute,
-    best_lag,
-    fit_motion,
-    wave_speed,
-)
+from .free_motion import MotionFit, Oscillation, absolute, best_lag, fit_motion, wave_speed
 from .motion import ODOMETRY_TOPIC, head_poses
-from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles
+from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles, mean_step
 
 LEAST_JOINTS = 4
 """Of a plane: fewer have no more than two modes and hardly a wave."""
@@ -136,15 +130,6 @@ def _travel(path: ChassisPath, cycle: GaitCycle) -> BodyTravel:
     length, width = np.sqrt(np.mean(path.semi_axes**2, axis=0)).tolist()
     forward, left, turn = map(mean_step, cycle.steps.T)
     return BodyTravel(forward, left, turn, length, width)
-
-
-def mean_step(steps: FloatArray) -> Estimate:
-    """Return the mean of a quantity of each cycle, its interval from their scatter."""
-    known = mean_of_cycles(steps)
-    if known is None:
-        return Estimate(float(steps.mean()) if steps.size else None)
-    value, variance, dof = known
-    return Estimate(value, around(value, t_factor(dof) * variance**0.5))
 
 
 def plane_shapes(
@@ -285,14 +270,9 @@ def _serpenoid(
         offset_rad=offset,
         waves=Estimate(abs(number) * turns, (low * turns, high * turns)),
         speed=speed,
-        speed_m_s=Estimate() if metres is None else _scaled(speed, metres),
+        speed_m_s=Estimate() if metres is None else scaled(speed, metres),
         unexplained=Estimate(left, (max(0.0, left - halves[3]), min(1.0, left + halves[3]))),
     )
-
-
-def _scaled(one: Estimate, factor: float) -> Estimate:
-    ci95 = None if one.ci95 is None else (one.ci95[0] * factor, one.ci95[1] * factor)
-    return Estimate(None if one.value is None else one.value * factor, ci95)
 
 
 def _nearest(

@@ -23,10 +23,12 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.harmonic import HarmonicModel, fit_at
+from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
 from ..response.rhythm import NYQUIST_SHARE
+from ..results.estimate import Estimate
 from ..signals.windows import Span
-from .motion import ODOMETRY_TOPIC, head_poses, link_centres
+from .motion import ODOMETRY_TOPIC, Poses, head_poses, link_centres
 from .null import SAMPLES, travel
 
 GRAVITY = 9.80665
@@ -89,18 +91,13 @@ def body_steps(
     return Steps(step @ way, cycle_s, sum(link.mass for link in robot.links))
 
 
-def centre_of_mass(
-    robot: Robot,
-    t_s: FloatArray,
-    poses: tuple[FloatArray, FloatArray, FloatArray],
-    angles: FloatArray,
-) -> FloatArray:
+def centre_of_mass(robot: Robot, t_s: FloatArray, poses: Poses, angles: FloatArray) -> FloatArray:
     """Return the centre of mass from the head's pose and the joint angles.
 
     Args:
         robot: The robot, m joints.
         t_s: Times wanted [s], shape (n,).
-        poses: Times [s], positions [m] and quaternions of the head; interpolated.
+        poses: Of the head; interpolated.
         angles: Joint angles at the wanted times [rad], shape (n, m).
 
     Returns:
@@ -136,6 +133,21 @@ def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
         return None
     count = per_cycle.size
     return float(per_cycle.mean()), float(per_cycle.var(ddof=1) / count), count - 1.0
+
+
+def mean_step(steps: FloatArray, least: float = -np.inf, most: float = np.inf) -> Estimate:
+    """Return the mean of a quantity of each cycle, its interval from their scatter.
+
+    Args:
+        least: Where the interval ends at the latest.
+        most: The same of its other end.
+    """
+    known = mean_of_cycles(steps)
+    if known is None:
+        return Estimate(float(steps.mean()) if steps.size else None)
+    value, variance, dof = known
+    low, high = around(value, t_factor(dof) * variance**0.5)
+    return Estimate(value, (max(least, low), min(most, high)))
 
 
 def speed(steps: Steps) -> tuple[float, float, float] | None:
@@ -237,15 +249,11 @@ def virtual_chassis(centres: FloatArray) -> tuple[ComplexArray, FloatArray, Floa
     return origin, np.angle(axis), np.sqrt(np.maximum(squares, 0.0))
 
 
-def chassis_path(
-    robot: Robot,
-    poses: tuple[FloatArray, FloatArray, FloatArray],
-    angles: Mapping[str, Series],
-) -> ChassisPath:
+def chassis_path(robot: Robot, poses: Poses, angles: Mapping[str, Series]) -> ChassisPath:
     """Follow the virtual chassis.
 
     Args:
-        poses: Times [s], positions [m] and quaternions of the head.
+        poses: Of the head.
         angles: Of every joint.
 
     Raises:
@@ -253,7 +261,7 @@ def chassis_path(
     """
     parts = [
         (t_s, *virtual_chassis(centres[..., :2]))
-        for t_s, centres in link_centres(robot, *poses, [angles[n] for n in robot.joint_names])
+        for t_s, centres in link_centres(robot, poses, [angles[n] for n in robot.joint_names])
     ]
     if not parts:
         raise DataError("the head's poses and the joint angles have no common time")

@@ -46,7 +46,6 @@ class ChangePoint:
         first: Index of the earliest session that the 95 % interval includes.
         last: Index of the latest one.
         gradual: Whether the change takes time; else it is a step.
-        before: Mean before the change, in the unit of the series.
         change: From before the change to its end.
         t: Size over its standard error, of the shape and session that fit best.
         p: Family-wise p-value over all series that were given.
@@ -57,7 +56,6 @@ class ChangePoint:
     first: int
     last: int
     gradual: bool
-    before: float
     change: float
     t: float
     p: float
@@ -137,7 +135,7 @@ def find_change_points(
     for column, (quantity, joint) in enumerate(columns):
         p = (1 + np.count_nonzero(null >= observed[column])) / (1 + len(null))
         if p <= LEVEL:
-            fitted = _fit(residuals[:, column], raw[:, column], basis, shapes, rng)
+            fitted = _fit(residuals[:, column], basis, shapes, rng)
             t = math.sqrt(observed[column])
             found[quantity].append(replace(fitted, joint=joint, t=t, p=float(p)))
     for changes in found:
@@ -184,11 +182,7 @@ def _left(residual: FloatArray, shapes: _Shapes) -> FloatArray:
 
 
 def _fit(
-    residual: FloatArray,
-    values: FloatArray,
-    basis: FloatArray,
-    shapes: _Shapes,
-    rng: np.random.Generator,
+    residual: FloatArray, basis: FloatArray, shapes: _Shapes, rng: np.random.Generator
 ) -> ChangePoint:
     """Fit a change; its joint, t and p-value are not known here."""
     n = len(residual)
@@ -204,14 +198,12 @@ def _fit(
     starts = shapes.starts[n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)]
     unit, raw = shapes.unit[best], shapes.raw[best]
     size = float(unit @ residual) / float(unit @ raw)
-    start = int(shapes.starts[best])
     return ChangePoint(
         joint=-1,
-        session=start,
+        session=int(shapes.starts[best]),
         first=int(starts.min()),
         last=int(starts.max()),
         gradual=bool(shapes.gradual[best]),
-        before=float(np.mean(values[:start])),
         change=size,
         t=math.nan,
         p=math.nan,

@@ -19,13 +19,9 @@ import pandas as pd
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import MissingExtraError
 
+from ..estimators.intervals import holm
 from ..results.estimate import Interval
-from .change_points import (
-    LEAST_SESSIONS,
-    LEVEL,
-    find_change_points,
-    relative_to_others,
-)
+from .change_points import LEAST_SESSIONS, LEVEL, find_change_points, relative_to_others
 
 _Frame: TypeAlias = Any  # pandas.DataFrame; its stubs don't know the columns' types
 
@@ -334,11 +330,9 @@ def _trends(sessions: _Frame) -> list[Trend]:
                     count,
                 )
             )
-    corrected, trends = 0.0, list[Trend]()
-    for rank, trend in enumerate(sorted(found, key=lambda trend: trend.p)):  # Holm (1979)
-        corrected = max(corrected, min(1.0, (len(found) - rank) * trend.p))
-        trends.append(replace(trend, p=corrected))
-    return trends
+    found.sort(key=lambda trend: trend.p)
+    adjusted = holm(np.array([trend.p for trend in found])).tolist()
+    return [replace(trend, p=p) for trend, p in zip(found, adjusted, strict=True)]
 
 
 def _covariates(sessions: _Frame) -> dict[str, FloatArray]:

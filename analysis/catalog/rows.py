@@ -13,12 +13,12 @@ from typing import Any
 
 import pyarrow as pa
 
+from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import MissingExtraError
 from undulog.capture.common.remote import ObjectStore
 from undulog.capture.log.read.facts import LogFacts
 
 _ARROW: Any = pa  # comes without types
-_NS = 1_000_000_000
 
 Row = dict[str, Any]
 
@@ -118,7 +118,7 @@ def session_row(facts: LogFacts) -> Row:
     part = facts.metadata.get("undulog.part", {})
     start_ns, end_ns, duration_s = facts.start_ns, facts.end_ns, None
     if start_ns is not None and end_ns is not None:
-        duration_s = (end_ns - start_ns) / _NS
+        duration_s = (end_ns - start_ns) / NS
         if max(start_ns, end_ns) >= 1 << 63:  # beyond what a time can be
             start_ns = end_ns = None
     return {

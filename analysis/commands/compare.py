@@ -75,12 +75,8 @@ def compare(
     from ..compare.decisions import Margins
     from ..present.text_experiment import render_comparison
 
-    choices = Choices(
-        paired=paired,
-        any_gait=any_gait,
-        margins=Margins(margin_gain, radians(margin_lag_deg)),
-        session=session,
-    )
+    margins = Margins(margin_gain, radians(margin_lag_deg))
+    choices = Choices(paired=paired, any_gait=any_gait, margins=margins, session=session)
     with progress("compare", total=sum(map(len, sides))) as bar:
         first = opened(sides[0], bar, robot=robot)
         second = opened(sides[1], bar, len(sides[0]), robot=robot)

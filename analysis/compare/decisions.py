@@ -13,40 +13,35 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 
-from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p
+from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p, holm
 from ..results import formats
-from ..results.comparison import (
-    BODY,
-    BrokenJoint,
-    Difference,
-    Equivalence,
-    NamedJoint,
-    of_body,
-)
+from ..results.comparison import BODY, BrokenJoint, Difference, Equivalence, NamedJoint, of_body
 from ..results.estimate import Estimate, leaves_out_zero
-from .quantities import Differences, Key, Quantities, from_runs, holm, independent, paired
+from .quantities import Differences, Key, Quantities, from_runs, independent, paired
 from .side import ComparedSession
 
 SIGNIFICANT_DIFFERENCE = 0.05
 """Family-wise level of the decisions, and level of each equivalence."""
 
-UNITS = {
-    "gain": "1",
-    "lag": "rad",
-    "amplitude": "rad",
-    "phase_lag": "rad",
-    "rest_amplitude": "rad",
-    "energy_abs": "J",
-    "speed": "m/s",
-    "cost_of_transport": "1",
-    "frequency": "Hz",
-    "wave_number": "rad/joint",
-    "travelling_index": "1",
+_COMPARED = {
+    "gain": ("gain", "1"),
+    "lag": ("lag", "rad"),
+    "amplitude": ("amplitude", "rad"),
+    "phase_lag": ("phase lag", "rad"),
+    "rest_amplitude": ("amplitude near rest", "rad"),
+    "energy_abs": ("E_abs per cycle", "J"),
+    "speed": ("speed", "m/s"),
+    "cost_of_transport": ("cost of transport", "1"),
+    "frequency": ("frequency", "Hz"),
+    "wave_number": ("wave number", "rad/joint"),
+    "travelling_index": ("travelling index", "1"),
 }
-"""What is compared, in this order: of each joint, then of the body."""
+"""Name and unit of what is compared, in this order: of each joint, then of the body."""
+
+WORDS = {quantity: name for quantity, (name, _) in _COMPARED.items()}
+UNITS = {quantity: unit for quantity, (_, unit) in _COMPARED.items()}
 
 _BY_RATIO = ("gain", "amplitude", "frequency")
-_ANGLES = ("lag", "phase_lag", "rest_amplitude")
 _CYCLIC = ("lag", "phase_lag")
 
 
@@ -254,21 +249,6 @@ def _equivalence(
 MOST = 4
 """Broken or differing joints that the sentence lists at most."""
 
-WORDS = {
-    "gain": "gain",
-    "lag": "lag",
-    "amplitude": "amplitude",
-    "phase_lag": "phase lag",
-    "rest_amplitude": "amplitude near rest",
-    "energy_abs": "E_abs per cycle",
-    "speed": "speed",
-    "cost_of_transport": "cost of transport",
-    "frequency": "frequency",
-    "wave_number": "wave number",
-    "travelling_index": "travelling index",
-}
-"""Names of the quantities in text."""
-
 RESPONSE = ("gain", "lag", "amplitude", "phase_lag", "rest_amplitude")
 """Quantities of a joint that make it a different one."""
 
@@ -346,6 +326,16 @@ def difference_text(one: Difference) -> str:
     return f"{WORDS[one.quantity]} {signed_difference(one)}"
 
 
+def people_unit(unit: str) -> tuple[float, str]:
+    """Return how many of a readable unit make one of a unit, and its text behind a number."""
+    units = {
+        "rad": (math.degrees(1), "°"),
+        "rad/joint": (math.degrees(1), "°/joint"),
+        "1": (1.0, ""),
+    }
+    return units.get(unit, (1.0, f" {unit}"))
+
+
 def in_people_units(one: Difference) -> tuple[Estimate, str]:
     """Convert a difference to percent or degrees.
 
@@ -353,12 +343,11 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
         Percent for gains, amplitudes and frequencies, degrees for lags (of wave numbers a joint),
         the travelling index as it is, and for the others percent of side A.
     """
-    if one.quantity in _ANGLES:
-        return formats.degrees(one.difference), "°"
-    if one.quantity == "wave_number":
-        return formats.degrees(one.difference), "°/joint"
     if one.quantity in _BY_RATIO:
         return formats.scaled(one.difference, 100.0), " %"
+    factor, unit = people_unit(one.unit)
+    if factor != 1:
+        return formats.scaled(one.difference, factor), unit
     if one.quantity == "travelling_index":
         return one.difference, ""
     if one.a > 0:
@@ -440,16 +429,7 @@ def margin_text(one: Equivalence, value: float | None = None) -> str:
     Args:
         value: In the test's unit; its margin if None.
     """
-    units = {
-        "rad": (math.degrees(1), "°"),
-        "rad/joint": (math.degrees(1), "°/joint"),
-        "1": (1.0, ""),
-    }
-    factor, unit = units.get(one.unit, (1.0, f" {one.unit}"))
+    factor, unit = people_unit(one.unit)
     if one.quantity in _BY_RATIO:
         factor, unit = 100.0, " %"
-    return f"{_short((one.margin if value is None else value) * factor)}{unit}"
-
-
-def _short(value: float) -> str:
-    return f"{value:.2g}"
+    return f"{(one.margin if value is None else value) * factor:.2g}{unit}"

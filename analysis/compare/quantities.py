@@ -151,22 +151,6 @@ def paired(a: FloatArray, b: FloatArray) -> Differences:
     return Differences(means.value, np.sqrt(variance), means.dof)
 
 
-def holm(p: FloatArray) -> FloatArray:
-    """Return step-down p-values that hold for the whole family (Holm 1979).
-
-    Args:
-        p: Of each by itself, shape (k,).
-
-    Returns:
-        Adjusted, shape (k,).
-    """
-    order = np.argsort(p, kind="stable")
-    steps = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(steps, 1.0)
-    return adjusted
-
-
 @dataclass(frozen=True)
 class Motion:
     """The periodic motion of one session.

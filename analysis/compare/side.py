@@ -288,21 +288,23 @@ def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]
         return found
     for group, members in zip(gait.groups, run.by_group, strict=True):
         for k, name in enumerate(group.answered):
-            zero_rad = float(np.angle(run.command[members[0]]))
-            window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
-            at = len(group.driven) + k
-            cut = cycles_by_phase(measured.responses[name], group.fit, at, **window)
-            if len(cut) > 1:
-                found[name] = from_runs(cut)
+            at, first = len(group.driven) + k, complex(run.command[members[0]])
+            found |= _mean_cycle(measured.responses[name], group.fit, at, first, span)
     return found
 
 
 def _cycles_of_motion(moved: MotionFit, span: Span) -> dict[str, Quantities]:
-    zero_rad = float(np.angle(moved.fit.fundamental[0]))
-    window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
     found: dict[str, Quantities] = {}
     for row, one in enumerate(moved.series):
-        cut = cycles_by_phase(one, moved.fit, row, **window)
-        if len(cut) > 1:
-            found[one.name] = from_runs(cut)
+        found |= _mean_cycle(one, moved.fit, row, complex(moved.fit.fundamental[0]), span)
     return found
+
+
+def _mean_cycle(
+    one: Series, fit: HarmonicFit, channel: int, reference: complex, span: Span
+) -> dict[str, Quantities]:
+    """Return the mean cycle by the phase of a reference, by name; empty without two cycles."""
+    zero_rad = float(np.angle(reference))
+    window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
+    cut = cycles_by_phase(one, fit, channel, **window)
+    return {one.name: from_runs(cut)} if len(cut) > 1 else {}

@@ -47,11 +47,7 @@ needs."""
 _AHEAD = -0.25
 """Delay, in sampling intervals, below which a joint would be ahead of its command."""
 
-_TIES = (
-    np.eye(PARAMETERS)[:, :3],
-    np.vstack((np.eye(4), np.eye(4)[3:])),
-    np.eye(PARAMETERS),
-)
+_TIES = (np.eye(PARAMETERS)[:, :3], np.vstack((np.eye(4), np.eye(4)[3:])), np.eye(PARAMETERS))
 """From what is fitted to all parameters: no step, one step, two steps."""
 
 

@@ -270,13 +270,8 @@ def cycles_of(
     if known.size >= MIN_DIFFERENCES:
         variance = np.divide(known.mean() / 2, answer, out=variance, where=answer > 0)
         dof = _difference_dof(known.size)
-    return Cycles(
-        np.concatenate([one[:-1] for one in edges]),
-        np.concatenate([one[1:] for one in edges]),
-        ratio,
-        variance,
-        dof,
-    )
+    starts, stops = ([one[:-1] for one in edges], [one[1:] for one in edges])
+    return Cycles(np.concatenate(starts), np.concatenate(stops), ratio, variance, dof)
 
 
 def _difference_dof(count: int) -> float:

@@ -31,7 +31,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.special import chdtri, gammaln, stdtr, stdtrit
@@ -130,7 +129,25 @@ def equivalence_p(
     return float(np.max(stdtr(dof, -score)))
 
 
+def holm(p: FloatArray) -> FloatArray:
+    """Return step-down p-values that hold for the whole family (Holm 1979).
+
+    Args:
+        p: Of each by itself, shape (k,).
+
+    Returns:
+        Adjusted, shape (k,).
+    """
+    order = np.argsort(p, kind="stable")
+    steps = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(steps, 1.0)
+    return adjusted
+
+
 CONFIDENCE = 0.95
+TAILS = ((1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2)
+"""Quantiles at the ends of an interval."""
 
 
 def welch_satterthwaite(variances: FloatArray, dof: FloatArray) -> FloatArray:
@@ -161,23 +178,35 @@ def around(value: float, half: float) -> Interval:
 DRAWS = 400
 
 
-class Noisy(Protocol):
-    """A matrix with standard errors and their degrees of freedom, all of shape (n, m).
+@dataclass(frozen=True)
+class NoisyMatrix:
+    """A measured matrix; columns are independent of each other.
 
-    ``correlation`` is that of a column's errors, shape (n, n), or None where they are independent.
+    Attributes:
+        value: Shape (n, m).
+        error: Standard errors, same shape.
+        dof: Degrees of freedom of the errors, same shape.
+        correlation: Of a column's errors, shape (n, n); None where they are independent.
     """
 
+    value: FloatArray
+    error: FloatArray
+    dof: FloatArray
+    correlation: FloatArray | None = None
+
     @property
-    def value(self) -> FloatArray: ...  # noqa: D102
+    def half(self) -> FloatArray:
+        """Half widths of the 95 % intervals, one by one, shape (n, m)."""
+        return self.error * stdtrit(self.dof, 0.5 + CONFIDENCE / 2)
+
     @property
-    def error(self) -> FloatArray: ...  # noqa: D102
-    @property
-    def dof(self) -> FloatArray: ...  # noqa: D102
-    @property
-    def correlation(self) -> FloatArray | None: ...  # noqa: D102
+    def half_together(self) -> FloatArray:
+        """Half widths that hold for all elements off the diagonal together (Bonferroni)."""
+        m = len(self.value)
+        return self.error * stdtrit(self.dof, 1 - (1 - CONFIDENCE) / (2 * m * (m - 1)))
 
 
-def noise_draws(matrix: Noisy, seed: int) -> FloatArray:
+def noise_draws(matrix: NoisyMatrix, seed: int) -> FloatArray:
     """Return the errors that a measured matrix may have.
 
     Returns:

@@ -77,11 +77,7 @@ class Series:
         limits = np.array([start_s, stop_s]) - _HALF_NS  # times are whole ns but for rounding
         i, j = np.searchsorted(self.t_s, limits, side="left")
         return Series(
-            self.name,
-            self.t_s[i:j],
-            self.values[i:j],
-            self.dropped_nan,
-            self.dropped_duplicates,
+            self.name, self.t_s[i:j], self.values[i:j], self.dropped_nan, self.dropped_duplicates
         )
 
 

@@ -81,14 +81,12 @@ class SlowChanges:
     """Model (1), fitted to k series of c cycles.
 
     Attributes:
-        p: Chance of as clear a trend in steady responses.
         level: The mean over the window, or the steady value.
         change: Mean change per cycle over the window; of a transient, how far the response is from
             its level at the start of the window.
         tau: Time constant, low and high end of its interval [cycles]; NaN without a transient.
         turn: Rotation of a transient per cycle [rad]; 0 where it does not oscillate.
         correlation: Of u from cycle to cycle, of gains and of lags; 0 where their scatter is white.
-        correlated: Posterior probability that it is not white, of gains and of lags.
         alike: Whether gains and lags scatter alike.
         dof: Degrees of freedom of the scatter of each series.
         excess: Chance that noise within the cycles makes the scatter between them.
@@ -97,24 +95,20 @@ class SlowChanges:
         share: See ``residuals``; of gains and of lags.
         effective: How many independent cycles would show the level as well; the lower of gains and
             lags.
-        explained: What the trend says of each series, shape (k, c).
     """
 
     trend: Trend
-    p: float
     level: Coefficients
     change: Coefficients
     tau: tuple[float, float, float]
     turn: float
     correlation: tuple[float, float]
-    correlated: tuple[float, float]
     alike: bool
     dof: int
     excess: float
     residuals: FloatArray
     share: tuple[float, float]
     effective: float
-    explained: FloatArray
 
 
 @dataclass(frozen=True)
@@ -168,12 +162,12 @@ def slow_changes(series: FloatArray, cycle: FloatArray, noise: CycleNoise) -> Sl
     white, *correlated = _noises(place, noise.relative)
     # Scatter that noise within the cycles explains has no correlation from cycle to cycle.
     grid = [white]
-    p, shapes = _clearest(series, place, grid)
+    shapes = _clearest(series, place, grid)
     excess = _excess(shapes, white, series, noise)
     if excess < EXCESS:
         grid = [white, *correlated]
-        p, shapes = _clearest(series, place, grid)
-    return _inferred(series, place, shapes, grid, p=p, excess=excess)
+        shapes = _clearest(series, place, grid)
+    return _inferred(series, place, shapes, grid, excess)
 
 
 def _excess(shapes: Shapes, white: _Noise, series: FloatArray, noise: CycleNoise) -> float:
@@ -308,19 +302,17 @@ def _rest(shapes: Shapes, s: int, noise: _Noise, series: FloatArray) -> FloatArr
     return np.asarray((right - basis @ (basis.T @ right)).T, dtype=np.float64)
 
 
-def _clearest(
-    series: FloatArray, place: FloatArray, noises: Sequence[_Noise]
-) -> tuple[float, Shapes]:
-    """Return the chance of the clearest trend, and the trends of the likeliest kind."""
+def _clearest(series: FloatArray, place: FloatArray, noises: Sequence[_Noise]) -> Shapes:
+    """Return the trends of the likeliest kind; steady where none is clear."""
     none = steady(place.size)
     if place.size < MIN_CYCLES:
-        return 1.0, none
+        return none
     null = [_fit(none, noise, series) for noise in noises]
     weights = _posterior(none, null, noises, series).weights[:, :, 0]
     likely = [np.flatnonzero(each >= _LIKELY).tolist() for each in weights]
     spread = range(1, len(noises), 5)
     tried = sorted({0, *likely[0], *likely[1], *spread})
-    p, best, chosen = 1.0, np.inf, none
+    best, chosen = np.inf, none
     for family in families(place):
         fits = {k: _fit(family, noises[k], series) for k in tried}
         found = _posterior(family, [fits[k] for k in tried], [noises[k] for k in tried], series)
@@ -331,9 +323,7 @@ def _clearest(
             after = np.concatenate([one.rss for one in _halves(fits[i], fits[j])], axis=1)
             chance += share * _chance(before, after, family, found.temper)
             total += share
-        own = min(1.0, _TRIALS[family.kind] * float(chance.min()) / total)
-        p = min(p, own)
-        if own > SIGNIFICANT:
+        if not _TRIALS[family.kind] * float(chance.min()) / total <= SIGNIFICANT:
             continue
         full = np.max([one.full for one in fits.values()], axis=0)
         value = _criterion(family, float(full.max()), series)
@@ -343,7 +333,7 @@ def _clearest(
             best, chosen = value, family
     if chosen.free:
         chosen = _zoomed(chosen, series, place, [noises[k] for k in tried])
-    return p, chosen
+    return chosen
 
 
 def _halves(gains: _Fits, lags: _Fits) -> tuple[_Fits, _Fits]:
@@ -353,10 +343,7 @@ def _halves(gains: _Fits, lags: _Fits) -> tuple[_Fits, _Fits]:
 
 
 def _zoomed(
-    shapes: Shapes,
-    series: FloatArray,
-    place: FloatArray,
-    noises: Sequence[_Noise],
+    shapes: Shapes, series: FloatArray, place: FloatArray, noises: Sequence[_Noise]
 ) -> Shapes:
     """Return transients on a grid as fine as the likelihood is narrow."""
     lowest, highest = float(shapes.tau.min()), shapes.longest
@@ -400,8 +387,6 @@ def _inferred(
     place: FloatArray,
     shapes: Shapes,
     noises: Sequence[_Noise],
-    *,
-    p: float,
     excess: float,
 ) -> SlowChanges:
     """Weigh the grid and give the coefficients."""
@@ -422,30 +407,25 @@ def _inferred(
     own_shares = np.stack([fit.cov[:, 0, 0] for fit in fits])  # of the variance, (noises, s)
     residuals: list[FloatArray] = []
     shares: list[float] = []
-    explained: list[FloatArray] = []
     for part, (i, s) in enumerate(found.best):
         own = slice(part * half, (part + 1) * half)
-        noise, fit = noises[i], fits[i]
+        noise = noises[i]
         whole: FloatArray = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")[0]
         residuals.append(series[own] @ noise.whiten.T @ whole[:, columns:])
-        shares.append(float(fit.cov[s, 0, 0]))
-        explained.append((shapes.designs[s] @ fit.beta[s][:, own]).T)
+        shares.append(float(fits[i].cov[s, 0, 0]))
     return SlowChanges(
         trend=Trend.SETTLING if shapes.free else Trend(shapes.kind),
-        p=p,
         level=level,
         change=turned,
         tau=positive_interval(shapes.tau, found.weights[0].sum(axis=0)),
         turn=float(shapes.turn[found.best[0][1]]),
         correlation=(noises[found.best[0][0]].correlation, noises[found.best[1][0]].correlation),
-        correlated=(float(correlated[0]), float(correlated[1])),
         alike=alike,
         dof=dof,
         excess=excess,
         residuals=np.concatenate(residuals),
         share=(shares[0], shares[1]),
         effective=1 / float((found.weights * own_shares).sum(axis=(1, 2)).max()),
-        explained=np.concatenate(explained),
     )
 
 

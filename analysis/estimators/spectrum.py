@@ -182,10 +182,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
             level[k] = np.trace(covariance[k]) / spread[k]
             dof[k] = draws(series[k].count)
     common = [common for common, _ in found]
-    return (
-        Noise(level, dof, covariance),
-        _common_bins(groups, common, shortest, spread, rounding),
-    )
+    return (Noise(level, dof, covariance), _common_bins(groups, common, shortest, spread, rounding))
 
 
 def _rounded(

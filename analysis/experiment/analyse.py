@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,22 +76,20 @@ def analyse_experiment(
         DataError: If they hold no samples.
         UsageError: If there is no session, or the options leave nothing of one.
     """
-    options = options or Options()
-    examined = _examine(sessions, options)
-    analyses, runs = examined.analyses, examined.runs
-    warnings: list[str] = []
+    examined = _examine(sessions, options or Options())
+    analyses, runs, warn = examined.analyses, examined.runs, examined.warn
     multisine = find_multisine(examined.periodic)
     if multisine is not None:
-        return _of_multisine(multisine, analyses, runs, options)
-    kicks = find_kicks(runs, examined.gaits)
+        return _of_multisine(multisine, examined)
+    kicks = find_kicks(runs)
     sweep = find_sweep(examined.commanded) if kicks is None else None
     if sweep is not None:
-        return _of_sweep(sweep, examined.commanded, analyses, runs, options)
+        return _of_sweep(sweep, examined)
     body = None
     if kicks is None:
         body, apart = body_connection(examined.cycles)
         if body is not None and body.fitted and len(sort_runs(runs)[0]) < MIN_GAITS:
-            return _of_perturbed(body, apart, examined, options)
+            return _of_perturbed(body, apart, examined)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
@@ -102,9 +101,7 @@ def analyse_experiment(
         why = {k: reason for k, reason in why.items() if parts[k] is None}
     parts_of = {k: part for k, part in enumerate(parts) if part is not None}
     parts_of |= {} if only_kicks else {k: role.value for k, role in roles.items()}
-    warnings += [
-        f"{runs[k].label} {text}; it is left out of the reversal test" for k, text in why.items()
-    ]
+    examined.leave_out(why, " of the reversal test")
     chosen = [runs[k] for k in roles]
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
@@ -120,29 +117,23 @@ def analyse_experiment(
         own = [analyses[k] for k in roles]
         joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
     reversal = None
-    if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
+    if not only_kicks and _both_ways(chosen, ways, names, robot, warn):
         reversal = _reversal(names, (forward, reverse), chosen, ways)
-        _warn_floor(reversal, warnings.append)
-        _warn_headings(reversal, warnings.append)
-    coupling = (
-        coupling_of_one_gait(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
-    )
+        _warn_floor(reversal, warn)
+        _warn_headings(reversal, warn)
+    coupling = coupling_of_one_gait(len(names)) if kicks is None else kick_coupling(kicks, warn)
     answer = (
         kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles, pooled, joints)
     )
-    return Experiment(
+    return _experiment(
+        examined,
+        parts_of,
+        why,
         # The answer on the runs of one direction has these joints in it.
-        answer=answer if joints is not None else broken_first(analyses, answer),
-        sessions=tuple(analyses),
-        runs=tuple(
-            _run(one, run, parts_of.get(k), why.get(k))
-            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
-        ),
+        answer if joints is not None else broken_first(analyses, answer),
+        coupling,
         heterogeneity=experiment_indices(forward, reverse, reversal),
         reversal=reversal,
-        coupling=coupling,
-        warnings=tuple(warnings),
-        provenance=_provenance(analyses, options),
         oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
         pooled=None if pooled is None else _pooled(pooled),
         body_connection=body,
@@ -151,8 +142,10 @@ def analyse_experiment(
 
 @dataclass(frozen=True)
 class _Examined:
-    """Sessions one by one, each list in their order."""
+    """Sessions one by one, each list in their order, and the warnings on all of them."""
 
+    options: Options
+    warnings: list[str] = field(default_factory=list[str])
     analyses: list[Analysis] = field(default_factory=list[Analysis])
     runs: list[GaitRun] = field(default_factory=list[GaitRun])
     gaits: list[GaitFit | None] = field(default_factory=list[GaitFit | None])
@@ -163,6 +156,15 @@ class _Examined:
         default_factory=list[MultisineRun | str | None]
     )
 
+    def warn(self, sentence: str) -> None:
+        """Add a warning."""
+        self.warnings.append(sentence)
+
+    def leave_out(self, why: Mapping[int, str], of: str = "") -> None:
+        """Warn of sessions that are left out, by index."""
+        for k, text in why.items():
+            self.warn(f"{self.runs[k].label} {text}; it is left out{of}")
+
 
 def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
     """Analyse each session.
@@ -170,7 +172,7 @@ def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
     Raises:
         UsageError: If there is none.
     """
-    found = _Examined()
+    found = _Examined(options)
     for session in sessions:
         measured = measure_session(session, options)
         analysis, gait, robot = measured.analysis, measured.gait, session.robot
@@ -190,93 +192,73 @@ def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
     return found
 
 
-def _of_sweep(
-    sweep: Sweep,
-    commanded: Sequence[CommandTones | None],
-    analyses: Sequence[Analysis],
-    runs: Sequence[GaitRun],
-    options: Options,
+def _experiment(
+    examined: _Examined,
+    roles: Mapping[int, str],
+    why: Mapping[int, str],
+    answer: str,
+    coupling: Coupling,
+    **more: Any,
 ) -> Experiment:
-    """Return the experiment of a lag sweep or a multisine: its gaits are not repeats."""
-    warnings = [
-        f"{run.label} is no run of the sweep; it is left out"
-        for k, run in enumerate(runs)
-        if k not in sweep.index
-    ]
-    paths = [Path(one.session.path) for one in analyses]
-    coupling = sweep_coupling(sweep, commanded, paths, options, warnings.append)
+    """Return the result.
+
+    Args:
+        roles: Of the sessions that have a part in the experiment, by index.
+        why: Why the others have none.
+        **more: Its other fields.
+    """
     none = np.zeros((0, 0), dtype=np.complex128)
-    return Experiment(
-        answer=broken_first(analyses, sweep_answer(coupling)),
-        sessions=tuple(analyses),
-        runs=tuple(
-            _run(one, run, *(("sweep", None) if k in sweep.index else (None, "is no run of it")))
-            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
+    reasons = {k: text for k, text in why.items() if k not in roles}
+    fields: dict[str, Any] = {
+        "heterogeneity": experiment_indices(none, none, None),
+        "reversal": None,
+        "sessions": tuple(examined.analyses),
+        "runs": tuple(
+            Run(one.session.id, one.session.path, run.wave, roles.get(k), reasons.get(k))
+            for k, (one, run) in enumerate(zip(examined.analyses, examined.runs, strict=True))
         ),
-        heterogeneity=experiment_indices(none, none, None),
-        reversal=None,
-        coupling=coupling,
-        warnings=tuple(warnings),
-        provenance=_provenance(analyses, options),
-    )
+        "warnings": tuple(examined.warnings),
+        "provenance": _provenance(examined.analyses, examined.options),
+    }
+    return Experiment(answer=answer, coupling=coupling, **fields | more)
+
+
+def _of_sweep(sweep: Sweep, examined: _Examined) -> Experiment:
+    """Return the experiment of a lag sweep or a multisine: its gaits are not repeats."""
+    analyses, others = examined.analyses, set(range(len(examined.runs))).difference(sweep.index)
+    for k in sorted(others):
+        examined.warn(f"{examined.runs[k].label} is no run of the sweep; it is left out")
+    paths = [Path(one.session.path) for one in analyses]
+    coupling = sweep_coupling(sweep, examined.commanded, paths, examined.options, examined.warn)
+    answer = broken_first(analyses, sweep_answer(coupling))
+    roles, why = dict.fromkeys(sweep.index, "sweep"), dict.fromkeys(others, "is no run of it")
+    return _experiment(examined, roles, why, answer, coupling)
 
 
 def _of_perturbed(
-    body: BodyConnection, apart: Mapping[int, str], examined: _Examined, options: Options
+    body: BodyConnection, apart: Mapping[int, str], examined: _Examined
 ) -> Experiment:
     """Return the experiment of gaits around one gait, each other than the rest."""
-    analyses, runs = examined.analyses, examined.runs
-    none = np.zeros((0, 0), dtype=np.complex128)
-    return Experiment(
-        answer=broken_first(analyses, connection_answer(body)),
-        sessions=tuple(analyses),
-        runs=tuple(
-            _run(one, run, None if k in apart else "perturbed", apart.get(k))
-            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
-        ),
-        heterogeneity=experiment_indices(none, none, None),
-        reversal=None,
-        coupling=_coupling_of_perturbed(examined.gaits),
-        body_connection=body,
-        warnings=tuple(f"{runs[k].label} {why}; it is left out" for k, why in apart.items()),
-        provenance=_provenance(analyses, options),
-    )
-
-
-def _coupling_of_perturbed(gaits: Iterable[GaitFit | None]) -> Coupling:
-    """Return that gaits whose whole wave is changed do not tell one joint from the others."""
-    known = [len(gait.all_answered) for gait in gaits if gait is not None]
-    return replace(
+    examined.leave_out(apart)
+    known = [len(gait.all_answered) for gait in examined.gaits if gait is not None]
+    coupling = replace(
         coupling_of_one_gait(min(known, default=0)),
         why="gaits perturbed as a whole do not tell the effect of one joint's command from that of "
         "the others",
     )
+    roles = {k: "perturbed" for k in range(len(examined.runs)) if k not in apart}
+    answer = broken_first(examined.analyses, connection_answer(body))
+    return _experiment(examined, roles, apart, answer, coupling, body_connection=body)
 
 
-def _of_multisine(
-    multisine: MultisineRuns,
-    analyses: Sequence[Analysis],
-    runs: Sequence[GaitRun],
-    options: Options,
-) -> Experiment:
+def _of_multisine(multisine: MultisineRuns, examined: _Examined) -> Experiment:
     """Return the experiment of random-phase multisines over a band."""
-    warnings = [f"{runs[k].label} {why}; it is left out" for k, why in multisine.why.items()]
-    found = best_linear_responses(multisine.runs, warnings.append)
-    none = np.zeros((0, 0), dtype=np.complex128)
-    return Experiment(
-        answer=broken_first(analyses, multisine_answer(found)),
-        sessions=tuple(analyses),
-        runs=tuple(
-            _run(one, run, "multisine" if k in multisine.index else None, multisine.why.get(k))
-            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
-        ),
-        heterogeneity=experiment_indices(none, none, None),
-        reversal=None,
-        coupling=coupling_of_one_gait(0),
-        best_linear=found,
-        warnings=tuple(warnings),
-        provenance=_provenance(analyses, options),
-    )
+    examined.leave_out(multisine.why)
+    found = best_linear_responses(multisine.runs, examined.warn)
+    roles = dict.fromkeys(multisine.index, "multisine")
+    answer = broken_first(examined.analyses, multisine_answer(found))
+    coupling = coupling_of_one_gait(0)
+    return _experiment(examined, roles, multisine.why, answer, coupling, best_linear=found)
 
 
 def _reversal(
@@ -364,10 +346,6 @@ def _warn_headings(reversal: Reversal, warn: Warn) -> None:
         f"the robot's {why}, so a tilted floor doesn't cancel; turn the robot by half a turn "
         "in half of the runs of each direction (undulog plan reversal)"
     )
-
-
-def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
-    return Run(one.session.id, one.session.path, run.wave, role, why if role is None else None)
 
 
 def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:

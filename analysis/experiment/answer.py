@@ -15,6 +15,7 @@ from ..results.coupling import (
     Coupling,
     LinearCoupling,
     LocalCoupling,
+    Lti,
     Route,
     RowCheck,
     RunScatter,
@@ -123,15 +124,20 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
         yield _scatter(coupling.scatter)
     lti = coupling.lti
     if lti.asymmetry.value is not None:
-        bands = ", ".join(
-            f"{formats.percent(share)} within {k} joint{'s' if k > 1 else ''}"
-            for k, share in enumerate((lti.within_1, lti.within_2, lti.within_3), start=1)
-        )
+        bands = _bands(lti, " joint", " joints")
         yield (
             "Read as a linear time-invariant chain, which it is not unless the nonlinearity is "
             f"small: X = H^-1 (condition number {coupling.condition_number:.3g}) has asymmetry "
             f"{formats.percent(lti.asymmetry)}; off-diagonal energy {bands}."
         )
+
+
+def _bands(one: Lti | ToneCoupling, joint: str = "", joints: str = "") -> str:
+    """Return the shares of the off-diagonal energy within one, two and three joints."""
+    shares = zip((one.within_1, one.within_2, one.within_3), (joint, joints, joints), strict=True)
+    return ", ".join(
+        f"{formats.percent(share)} within {k}{word}" for k, (share, word) in enumerate(shares, 1)
+    )
 
 
 def _scatter(scatter: RunScatter) -> str:
@@ -225,11 +231,8 @@ def _tone(tone: ToneCoupling) -> str:
     text = f"{tone.frequency_hz:.4g} Hz: condition numbers {', '.join(cond)}"
     if tone.asymmetry.value is not None:
         of = "X = H^-1" if tone.Z is None else "Z"
-        bands = ", ".join(
-            f"{formats.percent(share)} within {k}"
-            for k, share in enumerate((tone.within_1, tone.within_2, tone.within_3), start=1)
-        )
-        text += f"; {of}: asymmetry {formats.percent(tone.asymmetry)}, off-diagonal energy {bands}"
+        asymmetry = formats.percent(tone.asymmetry)
+        text += f"; {of}: asymmetry {asymmetry}, off-diagonal energy {_bands(tone)}"
     if tone.servo_difference is not None:
         off = formats.number(100 * tone.servo_difference, 1)
         text += f"; Z behind the described servos is {off} % off"

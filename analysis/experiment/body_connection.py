@@ -11,8 +11,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 
 from ..body.connection import Connection, condition_of, distances, fit_connection
-from ..body.shape import mean_step
-from ..body.travel import GaitCycle, wave_at
+from ..body.travel import GaitCycle, mean_step, wave_at
 from ..estimators.intervals import around
 from ..results import formats
 from ..results.body import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode

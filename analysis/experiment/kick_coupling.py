@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
-from ..estimators.intervals import CONFIDENCE
+from ..estimators.intervals import CONFIDENCE, NoisyMatrix, around
 from ..results.coupling import (
     BaseResponse,
     Coupling,
@@ -35,7 +35,6 @@ from ..results.estimate import Estimate
 from .kick_runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .local_coupling import (
     LocalMatrices,
-    MeasuredDerivatives,
     ResponseMatrices,
     local_matrices,
     lti_reading,
@@ -281,10 +280,7 @@ def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
 
 
 def _held_out(
-    experiment: KickExperiment,
-    change: ComplexArray,
-    base: ComplexArray,
-    found: LocalMatrices,
+    experiment: KickExperiment, change: ComplexArray, base: ComplexArray, found: LocalMatrices
 ) -> tuple[HeldOut, ...]:
     """Predict the held-out runs."""
     G, S = found.G, found.S
@@ -300,29 +296,20 @@ def _held_out(
     deviation = experiment.runs.deviation
     return tuple(
         predict(
-            deviation[k],
-            change[k],
-            variance[k],
-            response,
-            matrices,
-            session=experiment.labels[k],
+            deviation[k], change[k], variance[k], response, matrices, session=experiment.labels[k]
         )
         for k in experiment.runs.patterns
         if np.isfinite(change[k]).all()
     )
 
 
-def _rows(names: Sequence[str], sums: MeasuredDerivatives, expected: float) -> tuple[RowCheck, ...]:
+def _rows(names: Sequence[str], sums: NoisyMatrix, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
+    numbers = (one.tolist() for one in (sums.value, half, sums.error))
     return tuple(
-        RowCheck(
-            name,
-            expected,
-            Estimate(float(total), (float(total - wide), float(total + wide))),
-            float(error),
-        )
-        for name, total, wide, error in zip(names, sums.value, half, sums.error, strict=True)
+        RowCheck(name, expected, Estimate(total, around(total, wide)), error)
+        for name, total, wide, error in zip(names, *numbers, strict=True)
     )
 
 
@@ -354,10 +341,6 @@ def _scatter(found: LocalMatrices) -> RunScatter:
     )
 
 
-def _matrix(matrix: MeasuredDerivatives) -> Matrix:
-    return Matrix(
-        rows_of(matrix.value),
-        rows_of(matrix.error),
-        rows_of(matrix.half),
-        rows_of(matrix.half_together),
-    )
+def _matrix(matrix: NoisyMatrix) -> Matrix:
+    parts = matrix.value, matrix.error, matrix.half, matrix.half_together
+    return Matrix(*map(rows_of, parts))

@@ -16,14 +16,14 @@ from scipy.linalg import expm
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
-from ..estimators.intervals import CONFIDENCE, noise_draws
+from ..estimators.intervals import TAILS, NoisyMatrix, noise_draws
 from ..oscillators.laplacian import intervals_of, spectrum
 from ..oscillators.predictions import felt_response, measured, relaxation
 from ..results import formats
 from ..results.coupling import BaseResponse, LocalCoupling, rows_of
 from ..results.estimate import Estimate
 from ..results.oscillators import ClosedLoop, LoopMode, Relaxation
-from .local_coupling import MeasuredDerivatives, stacked
+from .local_coupling import stacked
 
 POINTS = 50
 """Times at which the rest of a kick is predicted."""
@@ -124,7 +124,7 @@ def _generators(
     error = np.concatenate([lag, np.array(base.gain_error) / gain])[:, None]
     dof = np.full_like(error, coupling.scatter.dof if coupling.scatter is not None else np.inf)
     dof = np.minimum(dof, 1e6)
-    of_base = MeasuredDerivatives(np.zeros_like(error), error, dof, correlation)
+    of_base = NoisyMatrix(np.zeros_like(error), error, dof, correlation)
     own = noise_draws(of_base, SEED + 1)[..., 0]
     turned = felt * np.exp(own[:, m:] + 1j * own[:, :m])
     drawn = relaxation(P.value + noise[:, :m], R.value + noise[:, m:], turned)
@@ -146,8 +146,7 @@ def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float)
         return np.stack(rows, axis=-2)
 
     here, there = followed(J), followed(drawn)
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(there, (tail, 1 - tail), axis=0)
+    low, high = np.quantile(there, TAILS, axis=0)
     return Relaxation(
         tuple(times.tolist()),
         rows_of(here),

@@ -16,7 +16,6 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
-from ..response.fitting import GaitFit
 from ..session.runs import SAME_FREQUENCY, GaitRun
 
 SAME = 0.01
@@ -233,11 +232,8 @@ class KickExperiment:
         return next((name for name, members in parts.items() if own in members), None)
 
 
-def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> KickExperiment | None:
+def find_kicks(runs: Sequence[GaitRun]) -> KickExperiment | None:
     """Recognise a kick experiment by its commands.
-
-    Args:
-        gaits: Their fits, in the same order.
 
     Returns:
         The experiment, or None where the runs are none.
@@ -251,7 +247,7 @@ def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> Kick
         seen.append(index)
         found = sort_kicks(np.stack([runs[k].command for k in index]))
         if found is not None and (best is None or len(found.kicks) > len(best.runs.kicks)):
-            best = _experiment(index, found, runs, gaits)
+            best = _experiment(index, found, [runs[k] for k in index])
     return best
 
 
@@ -264,29 +260,18 @@ def _same_drive(run: GaitRun, model: GaitRun) -> bool:
 
 
 def _experiment(
-    index: tuple[int, ...],
-    found: KickedRuns,
-    runs: Sequence[GaitRun],
-    gaits: Sequence[GaitFit | None],
+    index: tuple[int, ...], found: KickedRuns, runs: Sequence[GaitRun]
 ) -> KickExperiment:
-    names = runs[index[0]].names
-    noise = np.full((3, len(index), len(names)), np.nan)
-    for row, k in enumerate(index):
-        gait = gaits[k]
-        if gait is None or gait.response is None:
-            continue
-        at = [names.index(name) for name in gait.answered]
-        one = gait.response
-        noise[:, row, at] = one.log_gain_variance, one.lag_variance, one.dof
+    base, responses = runs[found.base[0]], [run.response for run in runs]
     return KickExperiment(
         index=index,
         runs=found,
-        names=names,
-        command=runs[index[found.base[0]]].command,
-        ratio=np.stack([runs[k].ratio for k in index]),
-        log_gain_variance=noise[0],
-        lag_variance=noise[1],
-        dof=noise[2],
-        labels=tuple(runs[k].label for k in index),
-        frequency_hz=runs[index[found.base[0]]].frequency_hz,
+        names=base.names,
+        command=base.command,
+        ratio=np.stack([one.ratio for one in responses]),
+        log_gain_variance=np.stack([one.log_gain_variance for one in responses]),
+        lag_variance=np.stack([one.lag_variance for one in responses]),
+        dof=np.stack([one.dof for one in responses]),
+        labels=tuple(run.label for run in runs),
+        frequency_hz=base.frequency_hz,
     )

@@ -40,7 +40,13 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
-from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
+from ..estimators.intervals import (
+    CONFIDENCE,
+    NoisyMatrix,
+    noise_draws,
+    norm_ratio,
+    welch_satterthwaite,
+)
 from ..results.coupling import LTI_LABEL, Lti, rows_of
 from ..results.estimate import Estimate
 from .kick_runs import Kick, Kind
@@ -68,46 +74,13 @@ class ResponseMatrices:
     def select(self, chosen: Sequence[int]) -> ResponseMatrices:
         """Return some of the runs."""
         index = list(chosen)
-        return ResponseMatrices(
-            self.log[index],
-            self.log_gain_variance[index],
-            self.phase_variance[index],
-            self.dof[index],
-            self.errors,
-        )
-
-
-@dataclass(frozen=True)
-class MeasuredDerivatives:
-    """A matrix of derivatives, row = responding joint, column = commanded joint.
-
-    Attributes:
-        value: Shape (m, m).
-        error: Standard errors, same shape; columns are independent of each other.
-        dof: Degrees of freedom of the errors, same shape.
-        correlation: Of a column's errors, shape (m, m); None where they are independent.
-    """
-
-    value: FloatArray
-    error: FloatArray
-    dof: FloatArray
-    correlation: FloatArray | None = None
-
-    @property
-    def half(self) -> FloatArray:
-        """Half widths of the 95 % intervals, one by one, shape (m, m)."""
-        return self.error * stdtrit(self.dof, 0.5 + CONFIDENCE / 2)
-
-    @property
-    def half_together(self) -> FloatArray:
-        """Half widths that hold for all elements off the diagonal together (Bonferroni)."""
-        m = len(self.value)
-        return self.error * stdtrit(self.dof, 1 - (1 - CONFIDENCE) / (2 * m * (m - 1)))
+        numbers = ("log", "log_gain_variance", "phase_variance", "dof")
+        return replace(self, **{name: getattr(self, name)[index] for name in numbers})
 
 
 def central_differences(
     kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
-) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
+) -> tuple[NoisyMatrix, NoisyMatrix]:
     """Return derivatives of phase and of log amplitude with respect to one kind of kick.
 
     Args:
@@ -145,11 +118,11 @@ def central_differences(
     error = np.sqrt(variance)
     both = None if errors is None else errors.correlation
     shared = (None, None) if both is None else (both[:m, :m], both[m:, m:])
-    phase, log_gain = map(MeasuredDerivatives, value, error, dof, shared)
+    phase, log_gain = map(NoisyMatrix, value, error, dof, shared)
     return phase, log_gain
 
 
-def row_sums(matrix: MeasuredDerivatives) -> MeasuredDerivatives:
+def row_sums(matrix: NoisyMatrix) -> NoisyMatrix:
     """Return sums over the columns: 1 for P, 0 for R, by time shift.
 
     Args:
@@ -162,14 +135,14 @@ def row_sums(matrix: MeasuredDerivatives) -> MeasuredDerivatives:
     parts = matrix.error.T**2
     shared = matrix.correlation is not None
     dof = matrix.dof.min(axis=1) if shared else welch_satterthwaite(parts, matrix.dof.T)
-    return MeasuredDerivatives(matrix.value.sum(axis=1), np.sqrt(parts.sum(axis=0)), dof)
+    return NoisyMatrix(matrix.value.sum(axis=1), np.sqrt(parts.sum(axis=0)), dof)
 
 
 def nonlinearity(
-    P: MeasuredDerivatives,
-    R: MeasuredDerivatives,
-    G: MeasuredDerivatives,
-    S: MeasuredDerivatives,
+    P: NoisyMatrix,
+    R: NoisyMatrix,
+    G: NoisyMatrix,
+    S: NoisyMatrix,
     *,
     correlation: FloatArray | None = None,
 ) -> Estimate:
@@ -199,9 +172,7 @@ def nonlinearity(
     )
 
 
-def stacked(
-    blocks: Sequence[Sequence[Noisy]], correlation: FloatArray | None
-) -> MeasuredDerivatives:
+def stacked(blocks: Sequence[Sequence[NoisyMatrix]], correlation: FloatArray | None) -> NoisyMatrix:
     """Return one matrix of several, for errors that they have in common.
 
     Args:
@@ -213,7 +184,7 @@ def stacked(
     def block(part: str) -> FloatArray:
         return np.block([[getattr(one, part) for one in row] for row in blocks])
 
-    return MeasuredDerivatives(block("value"), block("error"), block("dof"), correlation)
+    return NoisyMatrix(block("value"), block("error"), block("dof"), correlation)
 
 
 BANDS = (1, 2, 3)
@@ -226,8 +197,8 @@ SINGULAR = 1e10
 
 
 def lti_reading(
-    P: MeasuredDerivatives,
-    R: MeasuredDerivatives,
+    P: NoisyMatrix,
+    R: NoisyMatrix,
     response: ComplexArray,
     command: ComplexArray,
     *,
@@ -319,14 +290,14 @@ class LocalMatrices:
         widened: Factor on the errors of each joint's phase, then log amplitude, shape (2, m).
     """
 
-    P: MeasuredDerivatives
-    R: MeasuredDerivatives
-    G: MeasuredDerivatives | None
-    S: MeasuredDerivatives | None
+    P: NoisyMatrix
+    R: NoisyMatrix
+    G: NoisyMatrix | None
+    S: NoisyMatrix | None
     errors: RunErrors
     steady_errors: RunErrors
-    phase_rows: MeasuredDerivatives
-    gain_rows: MeasuredDerivatives
+    phase_rows: NoisyMatrix
+    gain_rows: NoisyMatrix
     agree: BoolArray
     widened: FloatArray
 
@@ -344,9 +315,7 @@ def local_matrices(
     each = [one for one in kicks if one is not None]
     of_kicks = answers.select(kicked)
 
-    def differences(
-        errors: RunErrors | None, kind: Kind
-    ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
+    def differences(errors: RunErrors | None, kind: Kind) -> tuple[NoisyMatrix, NoisyMatrix]:
         return central_differences(each, replace(of_kicks, errors=errors), kind)
 
     phase, log_gain = differences(None, Kind.PHASE)
@@ -367,13 +336,13 @@ def local_matrices(
     return LocalMatrices(P, R, G, S, errors, steady, sums[0], sums[1], agree, widened)
 
 
-def _agree(sums: MeasuredDerivatives, expected: float) -> BoolArray:
+def _agree(sums: NoisyMatrix, expected: float) -> BoolArray:
     """Return whether each sum is as expected, all 2 m of P and R together at 95 %."""
     quantile = stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(sums.value)))
     return np.abs(sums.value - expected) <= ROW_TOLERANCE + sums.error * quantile
 
 
-def _widening(sums: MeasuredDerivatives, expected: float, agree: BoolArray) -> FloatArray:
+def _widening(sums: NoisyMatrix, expected: float, agree: BoolArray) -> FloatArray:
     """Return the factor on each row's errors; 1 where all sums agree."""
     if agree.all():
         return np.ones(len(agree))
@@ -382,12 +351,12 @@ def _widening(sums: MeasuredDerivatives, expected: float, agree: BoolArray) -> F
 
 
 def _widen(
-    pair: tuple[MeasuredDerivatives, MeasuredDerivatives], factor: FloatArray
-) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
+    pair: tuple[NoisyMatrix, NoisyMatrix], factor: FloatArray
+) -> tuple[NoisyMatrix, NoisyMatrix]:
     """Multiply the errors by each row's factor, which as many sums determine."""
     m = len(factor[0])
 
-    def wider(one: MeasuredDerivatives, by: FloatArray) -> MeasuredDerivatives:
+    def wider(one: NoisyMatrix, by: FloatArray) -> NoisyMatrix:
         if np.all(by == 1.0):
             return one
         return replace(one, error=one.error * by[:, None], dof=np.minimum(one.dof, m))

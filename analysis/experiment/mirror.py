@@ -111,9 +111,7 @@ class MirrorTest:
 
 
 def mirror_test(
-    forward: ComplexArray,
-    reverse: ComplexArray,
-    strata: tuple[IntArray, IntArray] | None = None,
+    forward: ComplexArray, reverse: ComplexArray, strata: tuple[IntArray, IntArray] | None = None
 ) -> MirrorTest:
     """Test identical modules by reversal.
 

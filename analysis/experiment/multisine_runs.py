@@ -149,12 +149,8 @@ class MultisineRun:
         """Whether all commands are one but for sign and scale."""
         size = np.linalg.norm(self.command, axis=1)
         first = self.command[0] / size[0]
-        return bool(
-            (
-                np.abs(self.command.real @ first.real + self.command.imag @ first.imag) / size
-                > SAME_COMMAND
-            ).all()
-        )
+        along = np.abs(self.command.real @ first.real + self.command.imag @ first.imag)
+        return bool((along / size > SAME_COMMAND).all())
 
 
 @dataclass(frozen=True)
@@ -281,10 +277,7 @@ def _spectra(
 
 
 def _steady_periods(
-    design: MultisineDesign,
-    commands: Sequence[Series],
-    limits: tuple[float, float],
-    length: int,
+    design: MultisineDesign, commands: Sequence[Series], limits: tuple[float, float], length: int
 ) -> tuple[float, int]:
     """Find the last time at which most periods end that repeat one another.
 

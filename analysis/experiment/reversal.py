@@ -311,7 +311,6 @@ def reversal_of(
     known = headings or (np.full(len(forward), np.nan), np.full(len(reverse), np.nan))
     strata = heading_strata(*known)
     test = mirror_test(forward, reverse, strata)
-    shares = variance_shares(forward, reverse)
     half = test.critical * test.error
     bounds = (np.abs([test.difference.real, test.difference.imag]) + half).max(axis=1)
     kind = Headings.UNBALANCED if all(np.isfinite(one).all() for one in known) else Headings.UNKNOWN
@@ -335,11 +334,7 @@ def reversal_of(
         equivalence_lag_p=equivalence_p(
             test.difference.imag, test.error[1], test.dof[1], EQUIVALENT_LAG_RAD
         ),
-        module_variance=shares.module_variance,
-        boundary_variance=shares.boundary_variance,
-        noise_variance=shares.noise_variance,
-        module_share=shares.module_share,
-        boundary_share=shares.boundary_share,
+        **vars(variance_shares(forward, reverse)),
         tilt=tilt_check(forward, reverse, test, gravity_rad, kind),
         middle=names[len(names) // 2] if len(names) % 2 else None,
     )

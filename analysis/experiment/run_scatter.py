@@ -144,9 +144,7 @@ def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:
 
 
 def _foreseen(
-    kicks: Sequence[Kick | None],
-    m: int,
-    derivatives: tuple[ComplexArray, ComplexArray | None],
+    kicks: Sequence[Kick | None], m: int, derivatives: tuple[ComplexArray, ComplexArray | None]
 ) -> ComplexArray:
     """Return the response of a linear chain with these derivatives, shape (r, m)."""
     found = np.zeros((len(kicks), m), dtype=np.complex128)

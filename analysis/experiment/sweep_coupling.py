@@ -37,14 +37,7 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Servo
 
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ..results.coupling import (
-    ComplexMatrix,
-    Coupling,
-    LinearCoupling,
-    Route,
-    ToneCoupling,
-    rows_of,
-)
+from ..results.coupling import ComplexMatrix, Coupling, LinearCoupling, Route, ToneCoupling, rows_of
 from ..results.estimate import Estimate
 from ..signals.stretch import Options
 from .local_coupling import SINGULAR, UNKNOWN_SHAPE, reciprocity

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 
@@ -208,9 +208,6 @@ def _rate(name: str, fit: OscillatorFit) -> Rate:
     return Rate(name, omega, feedback, fit.noise)
 
 
-_NS = 1e9
-
-
 def session_couplings(
     session: SessionView, start_s: float | None = None, stop_s: float | None = None
 ) -> tuple[ChainCoupling, ...]:
@@ -224,7 +221,7 @@ def session_couplings(
         One a plane; none where no oscillator's phase was logged.
     """
     start_ns, stop_ns = (
-        None if one is None else session.start_ns + round(one * _NS) for one in (start_s, stop_s)
+        None if one is None else session.start_ns + round(one * NS) for one in (start_s, stop_s)
     )
     return tuple(
         chain_coupling(
@@ -244,10 +241,7 @@ _ADAPTIVE = {
 
 
 def closed_loop(
-    session: SessionView,
-    options: Options,
-    responses: Sequence[JointFrequencyResponse],
-    warn: Warn,
+    session: SessionView, options: Options, responses: Sequence[JointFrequencyResponse], warn: Warn
 ) -> str | None:
     """Find what makes the commands depend on measured motion, and warn of its bias.
 

@@ -34,7 +34,7 @@ from scipy.optimize import linear_sum_assignment
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws
+from ..estimators.intervals import CONFIDENCE, TAILS, NoisyMatrix, noise_draws
 from ..results.coupling import rows_of
 from ..results.estimate import Estimate
 from ..results.oscillators import Levels
@@ -147,8 +147,7 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     draws = [spectrum(one) for one in drawn]
     dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
     strong, counts = float(here.strong), [float(one.strong) for one in draws]
-    tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(counts, (tail, 1.0 - tail)).tolist()
+    low, high = np.quantile(counts, TAILS).tolist()
     fastest = growth(P)
     growing = _mirrored(np.array(fastest), np.array([growth(one) for one in drawn]))
     real = _mirrored(here.rates.real, dealt.real)
@@ -156,9 +155,9 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
         real=real,
         imag=_mirrored(here.rates.imag, dealt.imag),
         # Of the slowest mode itself: the lowest of several close ones is biased in every draw.
-        gap=Estimate(here.gap, (float(real[0, 0]), float(real[0, 1]))),
+        gap=Estimate(here.gap, tuple(real[0].tolist())),
         strong=Estimate(strong, (min(strong, low), max(strong, high))),
-        growth=Estimate(fastest, (float(growing[0]), float(growing[1]))),
+        growth=Estimate(fastest, tuple(growing.tolist())),
     )
 
 
@@ -170,9 +169,7 @@ def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
 
 def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
     """Return basic bootstrap intervals, shape (..., 2)."""
-    tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(draws, (1.0 - tail, tail), axis=0)
-    return np.stack([2.0 * value - low, 2.0 * value - high], axis=-1)
+    return np.stack([2.0 * value - end for end in np.quantile(draws, TAILS[::-1], axis=0)], axis=-1)
 
 
 POINTS = 41
@@ -198,7 +195,7 @@ def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> Floa
     return values[..., -1].astype(np.float64)
 
 
-def pseudospectrum(P: Noisy) -> Levels:
+def pseudospectrum(P: NoisyMatrix) -> Levels:
     """Return the levels around all eigenvalues, and the level of the noise of P."""
     here = of_deviations(P.value)
     error = of_deviations(P.value + noise_draws(P, 21)) - here

@@ -31,8 +31,6 @@ the same P. Absolute rates need the transients after kicks (:mod:`.chain`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import brentq
@@ -40,7 +38,7 @@ from scipy.special import stdtridf, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws
+from ..estimators.intervals import CONFIDENCE, TAILS, NoisyMatrix, noise_draws
 from ..results import formats
 from ..results.coupling import LocalCoupling, Matrix, rows_of
 from ..results.estimate import Estimate
@@ -87,7 +85,7 @@ MOST_CONDITION = 1e6
 """Condition number of P beyond which it isn't inverted."""
 
 
-def entrainment(P: Noisy) -> RelativeCoupling:
+def entrainment(P: NoisyMatrix) -> RelativeCoupling:
     """Read P as the matrix of an entrained chain.
 
     Args:
@@ -181,16 +179,6 @@ _MOST_DOF = 1e6
 """Student's t is a normal distribution by then."""
 
 
-@dataclass(frozen=True)
-class MeasuredP:
-    """P with its errors, each of shape (m, m); the correlation of a column's, or None."""
-
-    value: FloatArray
-    error: FloatArray
-    dof: FloatArray
-    correlation: FloatArray | None = None
-
-
 def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     """Predict oscillators with feedback from their servos.
 
@@ -222,7 +210,7 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     )
 
 
-def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP:
+def measured(matrix: Matrix, correlation: FloatArray | None = None) -> NoisyMatrix:
     """Convert a matrix of a result with its errors.
 
     Args:
@@ -238,14 +226,14 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP
     factor = np.divide(half, error, out=np.full(half.shape, np.nan), where=error > 0)
     dof = np.asarray(stdtridf(0.5 + CONFIDENCE / 2, factor), dtype=np.float64)
     usable = np.where(np.isfinite(dof) & (dof > 0), dof, _MOST_DOF)
-    return MeasuredP(value, error, np.minimum(usable, _MOST_DOF), correlation)
+    return NoisyMatrix(value, error, np.minimum(usable, _MOST_DOF), correlation)
 
 
 def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     return tuple(
         Mode(
-            real=Estimate(float(rate.real), _pair(ends.real[k])),
-            imag=Estimate(float(rate.imag), _pair(ends.imag[k])),
+            real=Estimate(float(rate.real), tuple(ends.real[k].tolist())),
+            imag=Estimate(float(rate.imag), tuple(ends.imag[k].tolist())),
             sensitivity=float(found.sensitivity[k]),
             pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
             pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
@@ -254,16 +242,15 @@ def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     )
 
 
-def _explicit(P: MeasuredP) -> Estimate:
+def _explicit(P: NoisyMatrix) -> Estimate:
     value = explicit_coupling(P.value)
     if value is None:
         return Estimate()
     draws = [explicit_coupling(P.value + one) for one in noise_draws(P, 41)[:EXPLICIT_DRAWS]]
     if None in draws:
         return Estimate(value)
-    tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(np.array(draws, dtype=np.float64), (tail, 1.0 - tail))
-    return Estimate(value, (min(value, float(low)), max(value, float(high))))
+    low, high = np.quantile(np.array(draws, dtype=np.float64), TAILS).tolist()
+    return Estimate(value, (min(value, low), max(value, high)))
 
 
 def _answer(found: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
@@ -290,7 +277,3 @@ def _pace(gap: Estimate) -> str:
         return f"relaxes at {formats.estimate(gap, ' eps', most=4)}"
     ends = None if gap.ci95 is None else (-gap.ci95[1], -gap.ci95[0])
     return f"grows at {formats.estimate(Estimate(-gap.value, ends), ' eps', most=4)}"
-
-
-def _pair(ends: FloatArray) -> tuple[float, float]:
-    return float(ends[0]), float(ends[1])

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import MissingChannelError, UsageError
 from undulog.capture.log.read.joint_topics import RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import JointSignals, Signal
@@ -38,7 +38,6 @@ from ..signals.columns import planes_of
 
 GAIT_TOPIC = "/gait"
 
-_NS = 1e9
 
 _SAME = 1e-6
 """Relative change of a rate that counts as none."""
@@ -113,7 +112,7 @@ def _log(
         return None
     t_ns = t_ns[known]
     phases = np.unwrap(columns[known], axis=0)
-    steps = np.diff(t_ns).astype(np.float64) / _NS
+    steps = np.diff(t_ns).astype(np.float64) / NS
     period_s = float(np.median(steps))
     whole: BoolArray = np.abs(steps - period_s) < _JITTER * period_s
     whole &= _steady(gait, plane, known)
@@ -146,7 +145,7 @@ def _inputs(
     size = 0.0 if amplitude is None else float(np.median(amplitude))
     if size <= 0.0:
         return None
-    then_ns = t_ns - round(period_s * _NS)
+    then_ns = t_ns - round(period_s * NS)
     felt = np.zeros_like(phases)
     for i, name in enumerate(names):
         offset = _value(gait, f"{name}.offset", known)
@@ -322,11 +321,7 @@ def _equations(
     means = _period_means(x).reshape(count, length, -1)
     steps = np.diff(phases[:, target]).reshape(count, length)
     weight = test / length
-    return (
-        np.einsum("l,wlc->wc", weight, means),
-        x[:-1:length],
-        steps @ weight / period_s,
-    )
+    return (np.einsum("l,wlc->wc", weight, means), x[:-1:length], steps @ weight / period_s)
 
 
 def _period_means(x: FloatArray) -> FloatArray:

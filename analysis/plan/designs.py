@@ -46,12 +46,7 @@ HIGHEST_HZ = RATE_HZ / 8
 
 
 def phase_kicks(
-    names: tuple[str, ...],
-    amplitude: ComplexArray,
-    repeats: int,
-    *,
-    kick: float,
-    base_runs: int,
+    names: tuple[str, ...], amplitude: ComplexArray, repeats: int, *, kick: float, base_runs: int
 ) -> tuple[PlannedRun, ...]:
     """Plan runs of the gait, four kicks of each joint, and held-out patterns.
 
@@ -121,15 +116,9 @@ def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
         m runs a repeat, in random order so that warming up looks like no lag.
     """
     random = np.random.default_rng(1)
-    order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
-    return tuple(
-        PlannedRun(
-            f"lag{k:02d}",
-            amplitude * dft(m)[k],
-            {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"},
-        )
-        for k in order
-    )
+    order: list[int] = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
+    facts = [{"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"} for k in range(m)]
+    return tuple(PlannedRun(f"lag{k:02d}", amplitude * dft(m)[k], facts[k]) for k in order)
 
 
 def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tuple[PlannedRun, ...]:

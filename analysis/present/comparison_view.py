@@ -221,15 +221,11 @@ def _facts(comparison: Comparison) -> list[Fact]:
     a, b = len(comparison.a), len(comparison.b)
     joints = len(joints_of(comparison))
     quantities = ("gain", "lag") if comparison.commanded else ("amplitude", "phase_lag")
-    responses = [WORDS[quantity] for quantity in quantities]
+    responses = " or ".join(WORDS[quantity] for quantity in quantities)
     facts = [
         Fact("Verdict", _VERDICTS[comparison.verdict], "all quantities together, Holm at 5 %"),
         Fact("Sessions", f"{a} and {b}", "on side A and B"),
-        Fact(
-            "Joints that differ",
-            f"{len(comparison.named)} of {joints}",
-            f"in {' or '.join(responses)}",
-        ),
+        Fact("Joints that differ", f"{len(comparison.named)} of {joints}", f"in {responses}"),
     ]
     for quantity in quantities:
         of = [one for one in comparison.differences if one.quantity == quantity]

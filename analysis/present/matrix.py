@@ -98,21 +98,17 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
     """
     if isinstance(coupling, LocalCoupling):
         amplitude = "log amplitude"
+        found = (
+            ("P", "phase", "phase", coupling.P),
+            ("R", amplitude, "phase", coupling.R),
+            ("G", amplitude, amplitude, coupling.G),
+            ("S", "phase", amplitude, coupling.S),
+        )
+        words = "{} of the response over {} of the command".format
         return tuple(
-            _entries(
-                symbol,
-                f"{what} of the response over {of} of the command",
-                coupling.joints,
-                matrix.value,
-                matrix.ci95_half,
-            )
-            for symbol, what, of, matrix in (
-                ("P", "phase", "phase", coupling.P),
-                ("R", amplitude, "phase", coupling.R),
-                ("G", amplitude, amplitude, coupling.G),
-                ("S", "phase", amplitude, coupling.S),
-            )
-            if matrix is not None
+            _entries(symbol, words(what, of), coupling.joints, one.value, one.ci95_half)
+            for symbol, what, of, one in found
+            if one is not None
         )
     if isinstance(coupling, LinearCoupling):
         return _sweep(coupling)
@@ -251,10 +247,7 @@ def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup
     sign = "plus" if value >= 0 else "minus"
     edge = 0.5 if box.side > 12 else 0.0
     side = box.side - 2 * edge
-    kind = {
-        "class_": f"{sign}{' own' if i == j else ''}",
-        "style": f"--v:{100 * level:.0f}%",
-    }
+    kind = {"class_": f"{sign}{' own' if i == j else ''}", "style": f"--v:{100 * level:.0f}%"}
     parts = [element("rect", x=box.x + edge, y=box.y + edge, width=side, height=side, **kind)]
     if value < 0 and level > 0.08:
         x, y = box.middle

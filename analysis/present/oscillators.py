@@ -8,17 +8,7 @@ from ..results import formats
 from ..results.oscillators import BodyOscillators
 from .matrix import Entries
 from .page_tables import Fact
-from .svg import (
-    DASHED,
-    INK,
-    REFERENCE,
-    Drawing,
-    drawing,
-    inline_svg,
-    key,
-    legend,
-    plot_estimate,
-)
+from .svg import DASHED, INK, REFERENCE, Drawing, drawing, inline_svg, key, legend, plot_estimate
 
 
 def body_facts(body: BodyOscillators) -> list[Fact]:

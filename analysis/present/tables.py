@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
@@ -18,6 +18,7 @@ from ..compare.decisions import (
     WORDS,
     decimals_of,
     in_people_units,
+    people_unit,
     signed,
     signed_difference,
 )
@@ -73,7 +74,6 @@ class Column(Generic[Row]):
         digits: Of numbers, on a terminal and on the page.
         kind: Numbers are set to the right; sentences wrap on the page.
         spare: A narrow terminal goes without the columns of the least number first; 0 stays.
-        note: What it is, shown above the table on the page.
     """
 
     text: str | None
@@ -82,7 +82,6 @@ class Column(Generic[Row]):
     digits: tuple[Digits, Digits] = (0, 0)
     kind: Literal["number", "word", "sentence", "code"] = "number"
     spare: int = 0
-    note: str = ""
 
     def cells(self, rows: Sequence[Row], where: int) -> list[Cell]:
         """Return the cells of the column.
@@ -106,18 +105,20 @@ class Table(Generic[Row]):
         rows: What each row is about.
         bold: Whether a row is set in bold.
         numbered: Whether rows are counted on the page.
+        about: Page heading of a column to what it is, shown above the table on the page.
     """
 
     columns: Sequence[Column[Row]]
     rows: Sequence[Row]
     bold: Callable[[Row], bool] = lambda _: False
     numbered: bool = False
+    about: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def notes(self) -> str:
-        """The columns' notes, for the page."""
-        noted = [column for column in self.columns if column.note]
-        return "; ".join(f"{str(one.page).split(' [')[0]}: {one.note}" for one in noted)
+        """The notes on columns, for the page."""
+        heads = [str(column.page) for column in self.columns if column.page in self.about]
+        return "; ".join(f"{head.split(' [')[0]}: {self.about[head]}" for head in heads)
 
 
 def _number(value: Cell | Estimate | float) -> Cell | Estimate:
@@ -131,9 +132,14 @@ def _p(p: float | None) -> PValue | None:
     return None if p is None else PValue(p)
 
 
-def typical(most: int) -> Callable[[Sequence[Estimate]], int]:
-    """Return the digits that the typical interval of the column deserves."""
-    return partial(formats.decimals_for, most=most)
+def typical(text: int, page: int) -> tuple[Digits, Digits]:
+    """Return the digits that the typical interval of the column deserves, at most so many.
+
+    Args:
+        text: On a terminal.
+        page: On the page.
+    """
+    return partial(formats.decimals_for, most=text), partial(formats.decimals_for, most=page)
 
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
@@ -156,49 +162,41 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
     def excitation(one: JointFrequencyResponse) -> str:
         return one.excitation if one.method == DIRECT else f"{one.excitation}, {one.method}"
 
+    def distortion(one: JointFrequencyResponse) -> Estimate:
+        return scaled(Estimate(one.distortion), 100.0)
+
     columns: list[Column[JointFrequencyResponse]] = [
         Column("joint", "joint", lambda one: one.joint, kind="word"),
         Column("command", "command", excitation, kind="word", spare=2),
         Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
         Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
-        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, (typical(4), typical(4))),
+        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, typical(4, 4)),
         Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
         Column(
-            "delay ms (95 %)",
-            "delay [ms]",
-            lambda one: scaled(one.delay_s, 1e3),
-            (typical(2), typical(3)),
-            note="with the offset of the clocks",
+            "delay ms (95 %)", "delay [ms]", lambda one: scaled(one.delay_s, 1e3), typical(2, 3)
         ),
         Column("is", "delay is", model, kind="word", spare=4),
-        Column(
-            "distortion %",
-            "distortion [%]",
-            lambda one: scaled(Estimate(one.distortion), 100.0),
-            (2, 2),
-            spare=3,
-            note="nonlinear, of the response; a dash where it can't be separated from noise",
-        ),
+        Column("distortion %", "distortion [%]", distortion, (2, 2), spare=3),
         Column("halves agree", "halves agree", agree, kind="word", spare=1),
     ]
-    return Table(columns, found)
+    about = {
+        "delay [ms]": "with the offset of the clocks",
+        "distortion [%]": "nonlinear, of the response; a dash where it can't be separated from "
+        "noise",
+    }
+    return Table(columns, found, about=about)
 
 
 def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
     """Return amplitude, offset and lag of joints that move without commands."""
     with_planes = any(one.plane for one in found)
-    angle = (typical(2), typical(4))
+    angle, lag = typical(2, 4), "lag behind the one before"
     columns: list[Column[JointMotion]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
         Column("amplitude° (95 %)", "amplitude [°]", lambda one: degrees(one.amplitude_rad), angle),
         Column("offset° (95 %)", "offset [°]", lambda one: degrees(one.offset_rad), angle, spare=1),
-        Column(
-            "lag behind the one before° (95 %)",
-            "lag behind the one before [°]",
-            lambda one: degrees(one.lag_rad),
-            angle,
-        ),
+        Column(f"{lag}° (95 %)", f"{lag} [°]", lambda one: degrees(one.lag_rad), angle),
     ]
     return Table(columns, found)
 
@@ -212,42 +210,31 @@ def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
             return f"undecided, {first} and {last}"
         return f"{first} to {last}" if one.direction == "first-to-last" else f"{last} to {first}"
 
+    def off(one: BodyWave) -> float:
+        return math.degrees(one.deviation_rad)
+
+    with_planes = any(one.plane for one in found)
+    angle, share = typical(2, 4), typical(3, 4)
     columns: list[Column[BodyWave]] = [
-        *(
-            [Column("plane", "plane", lambda one: one.plane, kind="word")]
-            if any(one.plane for one in found)
-            else []
-        ),
+        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
         Column("wave", "wave", way, kind="word"),
         Column(
-            "°/joint (95 %)",
-            "wave number [°/joint]",
-            lambda one: degrees(one.wave_number),
-            (typical(2), typical(4)),
-            note="lag from joint to joint, of a line through the phases",
+            "°/joint (95 %)", "wave number [°/joint]", lambda one: degrees(one.wave_number), angle
         ),
-        Column("waves (95 %)", "waves", lambda one: one.waves, (typical(3), typical(4))),
+        Column("waves (95 %)", "waves", lambda one: one.waves, share),
+        Column("joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, typical(2, 3)),
+        Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, share, spare=1),
         Column(
-            "joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, (typical(2), typical(3))
+            "travelling (95 %)", "travelling index [1]", lambda one: one.travelling_index, share
         ),
-        Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, (typical(3), typical(4)), spare=1),
-        Column(
-            "travelling (95 %)",
-            "travelling index [1]",
-            lambda one: one.travelling_index,
-            (typical(3), typical(4)),
-            note="1 of a travelling, 0 of a standing wave",
-        ),
-        Column(
-            "off the line°",
-            "off the line [°]",
-            lambda one: math.degrees(one.deviation_rad),
-            (1, 2),
-            spare=2,
-            note="root mean square of the phases about the line",
-        ),
+        Column("off the line°", "off the line [°]", off, (1, 2), spare=2),
     ]
-    return Table(columns, found)
+    about = {
+        "wave number [°/joint]": "lag from joint to joint, of a line through the phases",
+        "travelling index [1]": "1 of a travelling, 0 of a standing wave",
+        "off the line [°]": "root mean square of the phases about the line",
+    }
+    return Table(columns, found, about=about)
 
 
 _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | None], ...] = (
@@ -266,39 +253,18 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
     Args:
         joints: Those to show, in chain order.
     """
-    frequency = Column[JointResult](
-        "Hz",
-        "frequency [Hz]",
-        lambda j: j.frequency_hz,
-        (3, 4),
-        note="of the joint's group, for command, gain and lag",
-    )
+
+    def command(joint: JointResult) -> Estimate:
+        return degrees(Estimate(joint.command_amplitude_rad))
+
+    frequency = Column[JointResult]("Hz", "frequency [Hz]", lambda j: j.frequency_hz, (3, 4))
     columns: list[Column[JointResult]] = [
         Column("joint", "joint", lambda j: j.name, kind="word"),
         Column("plane", "plane", lambda j: j.plane, kind="word", spare=1),
         *([frequency] if len(analysis.gait.groups) > 1 else []),
-        Column(
-            "command°",
-            "command [°]",
-            lambda j: degrees(Estimate(j.command_amplitude_rad)),
-            (1, 2),
-            spare=5,
-            note="amplitude of the command at the gait frequency",
-        ),
-        Column(
-            "gain (95 %)",
-            "gain [1]",
-            lambda j: j.gain,
-            (typical(4), typical(4)),
-            note="amplitude of the response over that of the command",
-        ),
-        Column(
-            "lag° (95 %)",
-            "lag [°]",
-            lambda j: degrees(j.lag_rad),
-            (typical(2), typical(3)),
-            note="response behind command, positive is late",
-        ),
+        Column("command°", "command [°]", command, (1, 2), spare=5),
+        Column("gain (95 %)", "gain [1]", lambda j: j.gain, typical(4, 4)),
+        Column("lag° (95 %)", "lag [°]", lambda j: degrees(j.lag_rad), typical(2, 3)),
         *(
             Column[JointResult](f"{name} J", None, of, (_significant(3), 0), spare=spare)
             for name, _, of, spare in _ENERGIES
@@ -310,7 +276,13 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
         Column("flags", None, lambda j: " ".join(j.flags), kind="word"),
         Column(None, "flags", lambda j: ", ".join(j.flags), kind="word"),
     ]
-    return Table(columns, joints, numbered=True)
+    about = {
+        "frequency [Hz]": "of the joint's group, for command, gain and lag",
+        "command [°]": "amplitude of the command at the gait frequency",
+        "gain [1]": "amplitude of the response over that of the command",
+        "lag [°]": "response behind command, positive is late",
+    }
+    return Table(columns, joints, numbered=True, about=about)
 
 
 def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
@@ -318,9 +290,10 @@ def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
     digits = _significant(4)([Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints])
     columns: list[Column[JointResult]] = [
         Column(None, "joint", lambda j: j.name, kind="word"),
-        *(Column(None, f"{k} [J]", of, (0, digits), note=note) for k, note, of, _ in _ENERGIES),
+        *(Column(None, f"{name} [J]", of, (0, digits)) for name, _, of, _ in _ENERGIES),
     ]
-    return Table(columns, joints, numbered=True)
+    about = {f"{name} [J]": note for name, note, *_ in _ENERGIES}
+    return Table(columns, joints, numbered=True, about=about)
 
 
 def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
@@ -391,7 +364,7 @@ def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
 
 def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
     """Each joint against its mirror joint."""
-    relative, most = formats.relative, (typical(3), typical(5))
+    relative, most = formats.relative, typical(3, 5)
     columns: list[Column[MirrorJoint]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         Column("its mirror", "its mirror", lambda one: one.mirror, kind="word", spare=1),
@@ -445,8 +418,7 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
 
 def _side(one: Difference, value: float) -> str:
     """Return the value of a side, with the digits and the unit of both."""
-    factor = math.degrees(1) if one.unit in ("rad", "rad/joint") else 1.0
-    unit = {"rad": "°", "rad/joint": "°/joint", "1": ""}.get(one.unit, f" {one.unit}")
+    factor, unit = people_unit(one.unit)
     digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
     return formats.number(value * factor, digits) + unit
 
@@ -481,17 +453,16 @@ def waveform_table(comparison: Comparison) -> Table[Waveform]:
     """How far the mean cycles of each joint are apart."""
     phase = "gait phase" if comparison.commanded else "phase"
     most, rms = "largest ° (95 %, by itself)", "RMS of B - A °"
+
+    def at(one: Waveform) -> float:
+        return math.degrees(one.largest_at_rad)
+
     columns: list[Column[Waveform]] = [
         Column("mean cycle of", "joint", lambda one: one.name, kind="word"),
         Column(rms, "RMS [°]", lambda one: math.degrees(one.rms_rad), (2, 3)),
         Column(most, None, lambda one: signed(degrees(one.largest), "")),
         Column(None, "largest [°]", lambda one: degrees(one.largest), (2, 2)),
-        Column(
-            f"at {phase} °",
-            f"at {phase} [°]",
-            lambda one: math.degrees(one.largest_at_rad),
-            spare=1,
-        ),
+        Column(f"at {phase} °", f"at {phase} [°]", at, spare=1),
     ]
     return Table(columns, comparison.waveforms)
 

@@ -181,7 +181,8 @@ class Sheet:
             self.print(line, style)
 
     def table(self, table: tables.AnyTable) -> None:
-        """Add a table; columns that can be spared are left out on a narrow terminal."""
+        """Add an empty line and a table; a narrow terminal goes without columns to spare."""
+        self.print()
         columns = [column for column in table.columns if column.text is not None]
         cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
         styles = ["bold" if table.bold(row) else "" for row in table.rows]
@@ -241,7 +242,6 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     if any(one.value is not None for one in analysis.heterogeneity.values()):
         shown.append(tables.index_table(analysis.heterogeneity))
     for table in shown:
-        sheet.print()
         sheet.table(table)
     sheet.print()
     sheet.lines(more_lines(analysis))
@@ -287,7 +287,6 @@ def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False
     sheet = Sheet(width, color=color)
     sheet.print(formats.sentence(loop.answer), "bold")
     sheet.lines(map(formats.sentence, loop.limits))
-    sheet.print()
     sheet.table(_mode_table(loop))
     if loop.relaxation is not None:
         first, last = (np.array(loop.relaxation.phase_rad[k]) for k in (0, -1))

@@ -42,55 +42,39 @@ def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint
         known = one.noise_sd is not None and gain > 0
         return Estimate(100 * math.hypot(*one.noise_sd or ()) / gain if known else None)
 
-    def share(
-        name: str, of: Callable[[BestLinearJoint], Estimate], note: str, spare: int = 0
-    ) -> Column[BestLinearJoint]:
-        digits = (typical(2), typical(3))
-        return Column(
-            f"{name} % (95 %)",
-            f"{name} [%]",
-            lambda one: scaled(of(one), 100.0),
-            digits,
-            spare=spare,
-            note=note,
-        )
+    def share(name: str, spare: int = 0) -> Column[BestLinearJoint]:
+        def percent(one: BestLinearJoint) -> Estimate:
+            return scaled(getattr(one, name), 100.0)
+
+        return Column(f"{name} % (95 %)", f"{name} [%]", percent, typical(2, 3), spare=spare)
+
+    def lowest(one: BestLinearJoint) -> Estimate:
+        return Estimate(one.response.gain[0], one.response.gain_ci95[0])
+
+    def delay_ms(one: BestLinearJoint) -> Estimate:
+        return scaled(one.response.delay_s, 1e3)
 
     columns: list[Column[BestLinearJoint]] = [
         Column("joint", "joint", lambda one: one.response.joint, kind="word"),
         Column("from Hz", "from [Hz]", lambda one: one.response.frequency_hz[0], (3, 4), spare=6),
         Column("to Hz", "to [Hz]", lambda one: one.response.frequency_hz[-1], (2, 3), spare=6),
-        Column(
-            "gain there (95 %)",
-            "gain at the lowest [1]",
-            lambda one: Estimate(one.response.gain[0], one.response.gain_ci95[0]),
-            (typical(4), typical(4)),
-            spare=1,
-        ),
+        Column("gain there (95 %)", "gain at the lowest [1]", lowest, typical(4, 4), spare=1),
         Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.response.bandwidth_hz), (2, 3)),
-        Column(
-            "delay ms (95 %)",
-            "delay [ms]",
-            lambda one: scaled(one.response.delay_s, 1e3),
-            (typical(2), typical(3)),
-            spare=2,
-            note="with the offset of the clocks",
-        ),
-        Column("noise %", "noise [%]", noise, (2, 3), spare=3, note="of the mean response"),
-        share(
-            "distortion",
-            lambda one: one.distortion,
-            "nonlinear, over the gain, root mean squares over the lines; a dash where it can't be "
-            "separated from noise",
-        ),
-        share(
-            "odd",
-            lambda one: one.odd,
-            "response at odd lines that the command leaves out, over that at its own",
-            spare=5,
-        ),
-        share("even", lambda one: one.even, "the same at even lines", spare=4),
+        Column("delay ms (95 %)", "delay [ms]", delay_ms, typical(2, 3), spare=2),
+        Column("noise %", "noise [%]", noise, (2, 3), spare=3),
+        share("distortion"),
+        share("odd", spare=5),
+        share("even", spare=4),
     ]
-    return Table(columns, found)
+    about = {
+        "delay [ms]": "with the offset of the clocks",
+        "noise [%]": "of the mean response",
+        "distortion [%]": "nonlinear, over the gain, root mean squares over the lines; a dash "
+        "where it can't be separated from noise",
+        "odd [%]": "response at odd lines that the command leaves out, over that at its own",
+        "even [%]": "the same at even lines",
+    }
+    return Table(columns, found, about=about)
 
 
 MOST_CHANGES = 12
@@ -116,10 +100,8 @@ def render_comparison(
         sheet.print(f"Partial: {comparison.partial}")
     sheet.print()
     sheet.lines(_changed(comparison.changed))
-    sheet.print()
     sheet.table(difference_table(comparison))
     if comparison.waveforms:
-        sheet.print()
         sheet.table(waveform_table(comparison))
     sheet.print()
     sheet.print(_equivalence(comparison))
@@ -175,7 +157,6 @@ def render_experiment(
     reversal = experiment.reversal
     if reversal is not None:
         sheet.lines(reversal_detail(reversal))
-        sheet.print()
         sheet.table(mirror_table(reversal))
     if isinstance(experiment.coupling, LocalCoupling):
         sheet.lines(kick_detail(experiment.coupling))
@@ -184,15 +165,12 @@ def render_experiment(
     if isinstance(experiment.coupling, LinearCoupling):
         sheet.lines(sweep_detail(experiment.coupling))
     if experiment.best_linear is not None:
-        sheet.print()
         sheet.table(best_linear_table(experiment.best_linear.joints))
     body = experiment.body_connection
     if body is not None and body.fitted:
         sheet.lines(connection_detail(body))
-        sheet.print()
         sheet.table(travel_table(body))
         sheet.lines(refusals(body))
-    sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
@@ -336,8 +314,10 @@ def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
     def column(
         name: str, unit: str, of: Callable[[PredictedTravel], Estimate], spare: int = 0
     ) -> Column[PredictedTravel]:
-        shown = typical(1 if unit == "mm" else 2)  # what a camera tells apart
-        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, (shown, shown), spare=spare)
+        most = 1 if unit == "mm" else 2  # what a camera tells apart
+        return Column(
+            f"{name} {unit} (95 %)", f"{name} [{unit}]", of, typical(most, most), spare=spare
+        )
 
     def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
         return lambda one: formats.scaled(of(one), 1000.0)

@@ -188,9 +188,7 @@ def _linear(lines: _Lines, tau: Any, top: int, bottom: int) -> FloatArray:
         left = np.hstack([powers[:, : top + 1], -undelayed[:, None] * powers[:, 1 : bottom + 1]])
         left, right = left * weight[:, None], undelayed * weight
         found = np.linalg.lstsq(
-            np.vstack([left.real, left.imag]),
-            np.concatenate([right.real, right.imag]),
-            rcond=None,
+            np.vstack([left.real, left.imag]), np.concatenate([right.real, right.imag]), rcond=None
         )[0]
         below = _polynomial(lines.s, np.append(1.0, found[top + 1 :]))
         weight = lines.weight / np.maximum(np.abs(below), 1e-9)

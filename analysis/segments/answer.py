@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
-from undulog.capture.following.fault import KINDS as FAULT_KINDS
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
@@ -30,13 +29,7 @@ _NEGLIGIBLE = {"gain": 5e-4, "lag": math.radians(0.05)}
 """Shapes smaller than this are left to the tables."""
 
 _KIND_WORDS = {
-    "dead": "dead",
-    "jammed": "jammed",
-    "stalled": "stalled",
-    "inverted": "inverted",
-    "intermittent": "intermittent",
     "at_limit": "at a limit",
-    "slipped": "slipped",
     "swapped": "swapped with another joint",
     "frozen_sensor": "a frozen sensor",
     "inverted_sensor": "an inverted sensor",
@@ -47,8 +40,8 @@ _KIND_WORDS = {
     "wrapped_sensor": "a sensor that wrapped around",
     "drifting_sensor": "a drifting sensor",
     "clipped_sensor": "a clipped sensor",
-    "lost_samples": "lost samples",
 }
+"""Kinds of fault that their own name does not describe."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +125,7 @@ def kinds_in_words(kinds: Sequence[str]) -> str:
     Returns:
         For example ``jammed, dead or a frozen sensor``.
     """
-    words = [_KIND_WORDS.get(kind, FAULT_KINDS.get(kind, ("", kind))[1]) for kind in kinds]
+    words = [_KIND_WORDS.get(kind, kind.replace("_", " ")) for kind in kinds]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 

@@ -124,10 +124,7 @@ def _follows_there(motion: JointMotion | None, spans_s: Iterable[tuple[float, fl
 
 
 def not_following(
-    follows: Following,
-    artefacts: Iterable[Artefact],
-    names: tuple[str, ...],
-    duration_s: float,
+    follows: Following, artefacts: Iterable[Artefact], names: tuple[str, ...], duration_s: float
 ) -> tuple[NotFollowing, ...]:
     """Join faults with the artefacts that falsify a joint's position.
 

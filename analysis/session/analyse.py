@@ -20,12 +20,7 @@ from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
 from ..body.shape import MeasuredShape, body_shape
 from ..dead_band.find import dead_bands
-from ..energy import (
-    check_ledger,
-    energy_result,
-    joint_energies,
-    transport,
-)
+from ..energy import check_ledger, energy_result, joint_energies, transport
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
@@ -33,23 +28,13 @@ from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
-from ..results.analysis import (
-    Analysis,
-    JointResult,
-    SessionFacts,
-)
+from ..results.analysis import Analysis, JointResult, SessionFacts
 from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint
 from ..results.body import BodyResult, GroundContact
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
-from ..segments.session import (
-    compare_joints,
-    following,
-    not_following,
-    stopped,
-    unrefuted,
-)
+from ..segments.session import compare_joints, following, not_following, stopped, unrefuted
 from ..signals.artefacts import find_artefacts
 from ..signals.columns import Columns, drag_ratio, read_columns
 from ..signals.stretch import (
@@ -67,14 +52,9 @@ from .fields import SessionMeasurement, gait_facts, joint_results
 from .heterogeneity import heterogeneity_indices
 from .runs import coupling_of_one_gait
 
-_NS = 1e9
-
 
 def _warn_flags(
-    artefacts: Iterable[Artefact],
-    joints: tuple[JointResult, ...],
-    gait: GaitFit | None,
-    warn: Warn,
+    artefacts: Iterable[Artefact], joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn
 ) -> None:
     """Warn of each kind of artefact with its joints, and of responses lost in noise."""
     joined: dict[tuple[str, str, str], list[Artefact]] = {}
@@ -181,8 +161,8 @@ def measure_session(
     _warn_dropped(commands, responses, warn)
     session.forget()
     follows = following(session, columns, whole)
-    start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
-    held = unrefuted([one for one in artefacts if one.within(start_s, stop_s)], follows)
+    during = stretch.since(session.start_ns)
+    held = unrefuted([one for one in artefacts if one.within(*during)], follows)
     session.forget()
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
@@ -199,8 +179,7 @@ def measure_session(
         ()
         if gait is not None
         else frequency_responses(
-            *(commands, sound, warn),
-            _series(columns.names, columns.excitation, stretch, origin_ns),
+            *(commands, sound, warn), _series(columns.names, columns.excitation, stretch, origin_ns)
         )
     )
     del commands
@@ -233,12 +212,7 @@ def measure_session(
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     commanded = columns.commanded()
     findings = compare_joints(
-        session.robot,
-        gait,
-        joints,
-        faulty=faulty,
-        commanded=commanded,
-        offsets=follows.offsets,
+        session.robot, gait, joints, faulty=faulty, commanded=commanded, offsets=follows.offsets
     )
     analysis = Analysis(
         session=SessionFacts(
@@ -362,8 +336,7 @@ def _warn_dropped(
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
-    start_s = (stretch.start_ns - origin_ns) / _NS
-    stop_s = (stretch.stop_ns - origin_ns) / _NS
+    start_s, stop_s = stretch.since(origin_ns)
     if gait is None:
         return Span(origin_ns, start_s, stop_s, 0)
     first_s, stop_s, cycles = whole_cycles(start_s, stop_s, gait.fit.frequency_hz)

@@ -10,35 +10,23 @@ from typing import Any
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.robot.model import Robot
 
 from ..body.free_motion import MotionFit
 from ..body.travel import GaitCycle
-from ..energy import (
-    GAP_SHARE,
-    TERMS,
-    Energies,
-)
+from ..energy import GAP_SHARE, TERMS, Energies
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, coverage
 from ..estimators.trends import Trend
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..response.rhythm import phase_step, wave_name
-from ..results.analysis import (
-    Analysis,
-    GaitFacts,
-    GroupFacts,
-    JointResult,
-    Window,
-)
+from ..results.analysis import Analysis, GaitFacts, GroupFacts, JointResult, Window
 from ..results.answer import DeadBand
 from ..results.estimate import Estimate
 from ..signals.columns import Columns, by_plane, planes_of
 from ..signals.windows import Span, Stretch, whole_cycles
-
-_NS = 1e9
 
 
 @dataclass(frozen=True)
@@ -68,44 +56,36 @@ def gait_facts(
     session: SessionView, gait: GaitFit | None, span: Span, stretch: Stretch
 ) -> GaitFacts:
     """Return frequency, windows and wave of the gait, and of each group of joints."""
-    shift_s = (span.origin_ns - session.start_ns) / _NS
+    shift_s = (span.origin_ns - session.start_ns) / NS
     window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
     if gait is None:
         return GaitFacts(Estimate(), (window,))
-    groups = _group_facts(session.robot, gait, span, stretch, session.start_ns)
+    groups = _group_facts(session.robot, gait, window, stretch, session.start_ns)
     return GaitFacts(
         frequency_hz=groups[0].frequency_hz,
         windows=(window,),
         wave=groups[0].wave,
         lag_per_joint_rad=groups[0].lag_per_joint_rad,
-        fitted=Window(
-            (stretch.start_ns - session.start_ns) / _NS,
-            (stretch.stop_ns - session.start_ns) / _NS,
-            stretch.duration_s * gait.fit.frequency_hz,
-        ),
+        fitted=Window(*stretch.since(session.start_ns), stretch.duration_s * gait.fit.frequency_hz),
         groups=groups,
     )
 
 
 def _group_facts(
-    robot: Robot | None, gait: GaitFit, span: Span, stretch: Stretch, start_ns: int
+    robot: Robot | None, gait: GaitFit, window: Window, stretch: Stretch, start_ns: int
 ) -> tuple[GroupFacts, ...]:
     """Return frequency, whole cycles and wave of each group, the largest first.
 
     Args:
-        span: The largest group's whole cycles.
+        window: The largest group's whole cycles.
         start_ns: Unix time of the session's start [ns].
     """
-    ends = [(t - start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns)]
-    shift_s = (span.origin_ns - start_ns) / _NS
     result: list[GroupFacts] = []
     for index, group in enumerate(gait.groups):
         frequency = group.fit.frequency_hz
         half = t_factor(group.omega_dof) * group.omega_error / (2 * np.pi)
-        if index == 0:
-            window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
-        else:
-            first_s, last_s, cycles = whole_cycles(ends[0], ends[1], frequency)
+        if index > 0:
+            first_s, last_s, cycles = whole_cycles(*stretch.since(start_ns), frequency)
             window = Window(first_s, last_s, float(cycles))
         wave, steps = _wave(robot, group)
         estimate = Estimate(frequency, around(frequency, half))

@@ -105,10 +105,7 @@ class Spread:
 
 
 def index(
-    name: str,
-    value: float | None = None,
-    ci95: Interval | None = None,
-    p: float | None = None,
+    name: str, value: float | None = None, ci95: Interval | None = None, p: float | None = None
 ) -> Index:
     """Return an index of one of ``KINDS`` with its unit and label."""
     return Index(value, ci95, p, *KINDS[name])
@@ -132,12 +129,8 @@ def response_indices(response: Response) -> dict[str, Index]:
     gain, lag = response.gain, response.lag_near_mean_rad
     relative = gain / gain.mean()
     gain_variance, lag_variance = response.log_gain_variance * relative**2, response.lag_variance
-    both = spread(
-        np.concatenate([np.log(gain), lag]),
-        np.concatenate([response.log_gain_variance, lag_variance]),
-        dof,
-        blocks=2,
-    )
+    variances = np.concatenate([response.log_gain_variance, lag_variance])
+    both = spread(np.concatenate([np.log(gain), lag]), variances, dof, blocks=2)
     gains = spread(relative, gain_variance, dof)
     lags = _circular(lag, spread(lag, lag_variance, dof))
     found: dict[str, tuple[float, Interval | None, float]] = {

@@ -27,7 +27,6 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
 from undulog.capture.following.motion import JointMotion, Samples, linearised
 from undulog.capture.log.read.sample_times import LARGEST, Signal
-from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series, clean_together
 from ..results.answer import FALSIFYING, Artefact, Span
@@ -192,20 +191,12 @@ def limits_of(session: SessionView) -> dict[str, Limits]:
         return {}
     # A twin's servos are as they are stated, whatever the robot's may be.
     known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
-    return {joint.name: _limits(joint, known) for joint in robot.joints}
-
-
-def _limits(joint: Joint, known: bool) -> Limits:
-    servo = joint.servo
-    return Limits(
-        joint.lower,
-        joint.upper,
-        joint.max_velocity,
-        servo.stall_torque,
-        servo.supply_v / servo.resistance_ohm,
-        servo.supply_v,
-        known,
-    )
+    found: dict[str, Limits] = {}
+    for joint in robot.joints:
+        servo = joint.servo
+        sizes = (servo.stall_torque, servo.supply_v / servo.resistance_ohm, servo.supply_v)
+        found[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, known)
+    return found
 
 
 def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:

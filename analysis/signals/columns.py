@@ -28,10 +28,7 @@ VOLTAGE_TOPIC = "/joint_voltage"
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage", "reference")
 """What is read of each joint."""
 
-_OF_ITS_OWN = {
-    "velocity": ("/joint_velocity", "position"),
-    "effort": ("/joint_effort", "position"),
-}
+_OF_ITS_OWN = {"velocity": ("/joint_velocity", "position"), "effort": ("/joint_effort", "position")}
 
 
 @dataclass(frozen=True)

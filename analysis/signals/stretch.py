@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import IntArray
+from undulog.capture.common.arrays import NS, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError, UsageError
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
@@ -22,7 +22,6 @@ from .columns import QUANTITIES, Columns
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
 GAIT_TOPIC = "/gait"
-_NS = 1e9
 _WORTH_IT = 0.1
 """Less than this part of a session after its settling time is not worth leaving the rest out."""
 _AROUND_S = 2.0
@@ -121,8 +120,7 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
     """
     chosen = recorded(session, columns, options)
     if chosen.duration_s <= 0:
-        every = recorded(session, columns, Options())
-        first, last = ((t - session.start_ns) / _NS for t in (every.start_ns, every.stop_ns))
+        first, last = recorded(session, columns, Options()).since(session.start_ns)
         raise UsageError(
             f"{session.path}: nothing between --start and --stop; it has joint samples from "
             f"{first:.2f} to {last:.2f} s"
@@ -180,7 +178,7 @@ def fetched_part(session: SessionView, options: Options, warn: Warn) -> SessionV
         )
     warn(Note("only the window was fetched: artefacts and cycles around it are not known"))
     ends = [
-        None if t is None else session.start_ns + round((t + side) * _NS)
+        None if t is None else session.start_ns + round((t + side) * NS)
         for t, side in zip(chosen, (-_AROUND_S, _AROUND_S), strict=True)
     ]
     return session.part(*ends)
@@ -203,7 +201,7 @@ def recorded(session: SessionView, columns: Columns, options: Options) -> Stretc
             f"{session.path}: commands and responses don't overlap in time; their clocks differ"
         )
     chosen_s, first_ns = (options.start_s, options.stop_s), session.start_ns
-    return both.intersect(*(None if t is None else first_ns + round(t * _NS) for t in chosen_s))
+    return both.intersect(*(None if t is None else first_ns + round(t * NS) for t in chosen_s))
 
 
 def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
@@ -259,10 +257,10 @@ def _in_motion(
         start_s = span[0] if options.start_s is None else soft[0]
         span = start_s, span[1] if options.stop_s is None else soft[1]
         _warn_soft(soft, span, warn)
-    start, stop = (origin + round(time_s * _NS) for time_s in span)
+    start, stop = (origin + round(time_s * NS) for time_s in span)
     period = max((one.period_s for one in series if one.count > 1), default=0.0)
     # Moving to the last sample: that sample's own interval belongs to it.
-    ends = stretch.stop_ns - stop <= 2 * round(period * _NS)
+    ends = stretch.stop_ns - stop <= 2 * round(period * NS)
     return stretch.intersect(start, None if ends else stop)
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray
 
 from ..estimators.demodulation import starts_of
 from ..estimators.harmonic import cos_sin
@@ -207,7 +207,6 @@ class Span:
     cycles: int
 
 
-_NS = 1e9
 _STEADY = ("A", "omega", "lag", "offset")
 """Logged gait values that must stay; the phase runs on."""
 
@@ -233,7 +232,11 @@ class Stretch:
     @property
     def duration_s(self) -> float:
         """Length [s]."""
-        return (self.stop_ns - self.start_ns) / _NS
+        return (self.stop_ns - self.start_ns) / NS
+
+    def since(self, origin_ns: int) -> tuple[float, float]:
+        """Return start and stop from an origin [Unix ns], in seconds."""
+        return (self.start_ns - origin_ns) / NS, (self.stop_ns - origin_ns) / NS
 
     def intersect(self, start_ns: int | None, stop_ns: int | None) -> Stretch:
         """Return the part of it within limits.
@@ -301,7 +304,7 @@ def steady_runs(
     edges = np.concatenate([[0], np.flatnonzero(changed) + 1, [t_ns.size]])
     interval = int(np.median(np.diff(t_ns))) if t_ns.size > 1 else 1
     starts, stops = t_ns[edges[:-1]], np.append(t_ns, t_ns[-1] + interval)[edges[1:]]
-    kept_runs = stops - starts >= least_s * _NS
+    kept_runs = stops - starts >= least_s * NS
     pairs = zip(starts[kept_runs].tolist(), stops[kept_runs].tolist(), strict=True)
     return [Stretch(start, stop) for start, stop in pairs]
 
@@ -319,7 +322,7 @@ def settled(run: Stretch, session_start_ns: int, settle_s: float) -> Stretch:
     Returns:
         What is left of it.
     """
-    settle_ns = round(settle_s * _NS)
+    settle_ns = round(settle_s * NS)
     first = session_start_ns + settle_ns
     start = max(run.start_ns, first) if run.start_ns < first else run.start_ns + settle_ns
     return run.intersect(start, None)

@@ -40,10 +40,9 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import expm
 
-from undulog.analysis.estimators.intervals import noise_draws
+from undulog.analysis.estimators.intervals import NoisyMatrix, noise_draws
 from undulog.analysis.experiment.kick_coupling import kick_coupling
 from undulog.analysis.experiment.kick_runs import KickExperiment, sort_kicks
-from undulog.analysis.experiment.local_coupling import MeasuredDerivatives
 from undulog.analysis.oscillators.laplacian import intervals_of, spectrum
 from undulog.analysis.oscillators.predictions import (
     explicit_coupling,
@@ -302,7 +301,7 @@ def _drawn(own: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     own_error = np.concatenate([own["lag_error"], log_error])
     error = np.column_stack([np.vstack([P_error, R_error]), own_error])
     dof = np.full_like(error, float(own["dof"]))
-    drawn = noise_draws(MeasuredDerivatives(np.zeros_like(error), error, dof, correlation), 61)
+    drawn = noise_draws(NoisyMatrix(np.zeros_like(error), error, dof, correlation), 61)
     drawn = np.concatenate([np.zeros((1, *error.shape)), drawn[:DRAWS]])
     turned = felt * np.exp(drawn[:, n:, n] + 1j * drawn[:, :n, n])
     return P + drawn[:, :n, :n], R + drawn[:, n:, :n], turned

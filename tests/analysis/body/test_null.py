@@ -157,7 +157,9 @@ def test_what_is_seen_of_a_perfect_chain_is_its_null(name):
     t = 2 * np.pi / omega * np.arange(cycles * SAMPLES) / SAMPLES
     angles = np.tile(motion.angles, (cycles, 1))
     joints = [Series(j.name, t, angles[:, i]) for i, j in enumerate(robot.joints)]
-    points = observed(robot, Plane.HORIZONTAL, track(robot, t, position, quaternion, joints), omega)
+    points = observed(
+        robot, Plane.HORIZONTAL, track(robot, (t, position, quaternion), joints), omega
+    )
     commands = {int(i): (amplitudes[i], 0.0) for i in yaw}
     null = perfect_tracking(robot, Plane.HORIZONTAL, commands, omega=omega, cycles=cycles)[name]
     for point, expected in zip(points, null, strict=True):
@@ -183,7 +185,7 @@ def test_a_vertical_gait_is_seen_upwards_and_has_no_viscous_null():
     t = 2 * np.pi / omega * np.arange(head.size) / SAMPLES
     angles = -np.tile(motion.angles, (cycles, 1))
     joints = [Series(j.name, t, angles[:, i]) for i, j in enumerate(robot.joints)]
-    points = observed(robot, Plane.VERTICAL, track(robot, t, position, quaternion, joints), omega)
+    points = observed(robot, Plane.VERTICAL, track(robot, (t, position, quaternion), joints), omega)
     commands = {i: (c, 0.0) for i, c in enumerate(amplitudes)}
     null = perfect_tracking(robot, Plane.VERTICAL, commands, omega=omega, cycles=cycles)
     assert set(null) == {"free"}

@@ -5,13 +5,8 @@ import pytest
 from scipy import stats
 
 from undulog.analysis.compare.decisions import Margins, decide
-from undulog.analysis.compare.quantities import (
-    Quantities,
-    from_runs,
-    holm,
-    independent,
-    paired,
-)
+from undulog.analysis.compare.quantities import Quantities, from_runs, independent, paired
+from undulog.analysis.estimators.intervals import holm
 from undulog.capture.common.errors import UsageError
 
 SEEDS = 600

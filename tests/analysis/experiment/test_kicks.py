@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from support.linear_chain import asymmetry, within
+from undulog.analysis.estimators.intervals import NoisyMatrix
 from undulog.analysis.experiment.kick_coupling import predict, valid_to
 from undulog.analysis.experiment.kick_runs import (
     Kick,
@@ -14,7 +15,6 @@ from undulog.analysis.experiment.kick_runs import (
     sort_kicks,
 )
 from undulog.analysis.experiment.local_coupling import (
-    MeasuredDerivatives,
     ResponseMatrices,
     central_differences,
     lti_reading,
@@ -208,8 +208,8 @@ def test_the_intervals_of_the_linear_reading_cover(reciprocal):
 
 
 def test_a_singular_reading_is_not_inverted():
-    flat = MeasuredDerivatives(np.full((3, 3), 1 / 3), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
-    nothing = MeasuredDerivatives(np.zeros((3, 3)), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
+    flat = NoisyMatrix(np.full((3, 3), 1 / 3), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
+    nothing = NoisyMatrix(np.zeros((3, 3)), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
     reading = lti_reading(flat, nothing, np.ones(3, complex), np.ones(3, complex))
     assert reading.asymmetry.value is None
     assert reading.condition_number is None or reading.condition_number > 1e10
