@@ -7,7 +7,7 @@ from mcap_ros2.writer import Writer
 
 from support import built_results, linear_chain
 from support.analysed import analysed, experiment
-from undulog.capture import SessionWriter
+from support.joint_runs import write_joints
 from zoo.bags import JOINT_STATE
 
 EPOCH_NS = 1_735_689_600_123_456_789
@@ -94,8 +94,6 @@ def wave():
     return Wave
 
 
-RATE_HZ = 100
-REPORT_EPOCH_NS = 1_767_225_600_000_000_000
 HOSTILE = "<script>alert('x')</script>$\\frac{a}{b$\x00&\"蛇"
 
 
@@ -128,21 +126,14 @@ def recorded(snake, tmp_path_factory):
     """A session of the snake: commands and responses follow the analysis to the letter."""
     path = tmp_path_factory.mktemp("session") / "weak.mcap"
     names = [joint.name for joint in snake.joints]
+    phase = np.pi * np.arange(1601)[:, None] / 100 - np.pi / 6 * np.arange(25)
     amplitude = np.array([joint.command_amplitude_rad or 0.0 for joint in snake.joints])
     gain = np.array([joint.gain.value or 0.0 for joint in snake.joints])
     lag = np.array([joint.lag_rad.value or 0.0 for joint in snake.joints])
-    with SessionWriter(path, session_id="s", epoch_ns=REPORT_EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(16 * RATE_HZ + 1):
-            phase = 2 * np.pi * 0.5 * k / RATE_HZ - np.pi / 6 * np.arange(25)
-            position = amplitude * gain * np.sin(phase - lag)
-            if k == 1400:
-                position[0] = np.nan
-            t_ns = REPORT_EPOCH_NS + k * (1_000_000_000 // RATE_HZ)
-            commands.write(t_ns, amplitude * np.sin(phase))
-            states.write(t_ns, position)
-    return path
+    position = amplitude * gain * np.sin(phase - lag)
+    position[1400, 0] = np.nan
+    when = {"rate_hz": 100, "epoch_ns": built_results.START_NS}
+    return write_joints(path, names, amplitude * np.sin(phase), [position], **when)
 
 
 @pytest.fixture(scope="session")
