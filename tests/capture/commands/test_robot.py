@@ -63,7 +63,7 @@ def test_new_without_a_log_is_valid_and_commented(tmp_path, command):
     assert load_robot(path).joint_names == ("joint01", "joint02")
 
 
-def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command, report_of):
+def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command, report_of, opened):
     log, path = write(tmp_path / "log.mcap"), tmp_path / "mine.toml"
     command("robot", "new", "-o", path, "--from", log)
     text = path.read_text()
@@ -72,8 +72,7 @@ def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command,
     with Session.open(log, robot=path) as session:
         assert session.robot == load_robot(path)
         assert session.joints("/joint_states").names == ("knee", "hip")
-    with Session.open(log) as session:
-        assert session.robot is None
+    assert opened(log).robot is None
     found = report_of("analyse", log, "--robot", path)
     assert found["session"]["robot"] == "mine"
     assert [joint["plane"] for joint in found["joints"]] == ["horizontal"] * 2

@@ -328,8 +328,7 @@ def test_a_recovered_file_opens_in_foreign_readers(path):
     rerun = Path(sys.executable).with_name("rerun")
     if not rerun.exists():
         pytest.skip("rerun is not installed")
-    done = processes.run(rerun, "mcap", "check", output)
-    assert done.returncode == 0, done.stdout + done.stderr
+    processes.run(rerun, "mcap", "check", output, code=0)
 
 
 def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_path, path):
