@@ -93,8 +93,7 @@ def recorder(source, output):
 
 def driven(scenario, port, control, *words):
     on = ("--on", f"can:socketcand:can0?port={port}", "--arm", "--recorder", control, "--json")
-    done = undulog("drive", scenario, *on, *words, "-o", control.with_suffix(".drive.mcap"))
-    assert done.returncode == 0, done.stderr
+    done = undulog("drive", scenario, *on, *words, "-o", control.with_suffix(".drive.mcap"), code=0)
     return json.loads(done.stdout)
 
 
