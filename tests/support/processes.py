@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from contextlib import contextmanager
@@ -88,6 +89,27 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
         each()
         time.sleep(0.005)
     return found
+
+
+@contextmanager
+def repeating(step, pause_s):
+    """Call a function again and again in a thread, until the end of the block.
+
+    An exception in it fails the test: pytest warns of it.
+    """
+    ended = threading.Event()
+
+    def loop():
+        while not ended.wait(pause_s):
+            step()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def alive(pid):

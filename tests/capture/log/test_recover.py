@@ -35,12 +35,9 @@ def fingerprint(folder):
 
 def child_command(path, **options):
     """The command of a recorder in a process of its own."""
-    sizes, intervals = (
-        ("segment_size", "ballast"),
-        {"sync_interval_s": 0.05, "flush_interval_s": 0.2},
-    )
-    options = {**dict.fromkeys(sizes, 1 << 16), **intervals, **options}
-    return [sys.executable, recorder.__file__, str(path), json.dumps(options)]
+    usual = {"segment_size": 1 << 16, "ballast": 1 << 16}
+    usual |= {"sync_interval_s": 0.05, "flush_interval_s": 0.2}
+    return [sys.executable, recorder.__file__, str(path), json.dumps(usual | options)]
 
 
 @pytest.fixture
