@@ -56,28 +56,12 @@ def weak():
 @pytest.fixture
 def uneven(make_uneven, make_scenario):
     """A scenario whose links, servos and limits differ, driven in both planes."""
-    robot = make_uneven(6)
-    joints = [
-        dataclasses.replace(
-            joint,
-            servo=dataclasses.replace(
-                joint.servo,
-                stall_torque=0.3 + 0.1 * i,
-                backlash=0.02 * (i % 2),
-                supply_v=6 + i,
-                static_friction=0.05 * (i % 3 == 0),
-            ),
-        )
-        for i, joint in enumerate(robot.joints)
-    ]
-    links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
-    robot = dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
     planes = {
         Plane.HORIZONTAL: PlaneGait(0.4, 0.7, 1.0, offset=0.05),
         Plane.VERTICAL: PlaneGait(0.1, 1.0, 0.5, phase=0.3),
     }
     return make_scenario(
-        robot,
+        make_uneven(6),
         gait=Serpentine(planes, ramp_s=0.5),
         world=World(gravity=(0.4, -0.2, -9.6), heading=0.7, velocity=(0.1, -0.05, 0.02)),
     )
