@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 
-from support.processes import repeating, start, wait_for
+from support.processes import process, repeating, wait_for
 from undulog.capture.common.errors import DataError
 
 PATIENCE_S = 60.0
@@ -84,10 +84,6 @@ def started_recorder(path, extra="", first="ready\n"):
         "    server.poll()\n"
         "    time.sleep(0.005)\n"
     )
-    process = start(sys.executable, "-c", code, stdin=subprocess.PIPE)
-    try:
-        assert process.stdout.readline() == first
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    with process(sys.executable, "-c", code, stdin=subprocess.PIPE) as running:
+        assert running.stdout.readline() == first
+        yield running
