@@ -5,12 +5,11 @@ import math
 import os
 import pickle
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from support.processes import python
 from support.twin_runs import simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
@@ -307,8 +306,7 @@ def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
     runs = [one, dataclasses.replace(one, world=dataclasses.replace(one.world, heading=1.2))]
     (tmp_path / "runs").write_bytes(pickle.dumps(runs))
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
-    command = [sys.executable, "-c", GPU, tmp_path / "runs", tmp_path / "done.npz", "float64"]
-    subprocess.run(command, check=True, env=environment, timeout=300)
+    python(GPU, tmp_path / "runs", tmp_path / "done.npz", "float64", env=environment, code=0)
     expected = [part for one in run_batch(runs) for part in (one.angle, one.work, one.head)]
     assert abs(expected[0][-1]).max() > 1e-3
     with np.load(tmp_path / "done.npz") as found:
