@@ -3,12 +3,11 @@ results built by hand; experiments with a linear chain."""
 
 import numpy as np
 import pytest
-from mcap_ros2.writer import Writer
 
 from support import built_results, linear_chain
 from support.analysed import analysed, experiment
 from support.joint_runs import write_joints
-from zoo.bags import JOINT_STATE
+from support.written_sessions import joint_state, write_foreign
 
 EPOCH_NS = 1_735_689_600_123_456_789
 
@@ -17,18 +16,12 @@ class Bag:
     """A ROS 2 bag of JointStates."""
 
     def __init__(self, path):
-        self.path = path
-        self._file = path.open("wb")
-        self._writer = Writer(self._file)
-        self._schema = self._writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        self.path, self.messages = path, []
 
     def write(self, topic, t_ns, names, *fields):
-        t_ns = int(t_ns)
-        stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
-        values = zip(("position", "velocity", "effort"), (*fields, (), ()), strict=False)
-        message = {name: [float(v) for v in one] for name, one in values}
-        message |= {"header": {"stamp": stamp, "frame_id": ""}, "name": list(names)}
-        self._writer.write_message(topic, self._schema, message, t_ns, t_ns)
+        values = zip(("position", "velocity", "effort"), fields, strict=False)
+        content = {name: np.asarray(one, dtype=float).tolist() for name, one in values}
+        self.messages.append((topic, int(t_ns), joint_state(int(t_ns), list(names), **content)))
 
     def write_both(self, t_ns, names, command, *response):
         """Write a command and the state at the same time."""
@@ -36,8 +29,7 @@ class Bag:
         self.write("/joint_states", t_ns, names, *response)
 
     def close(self):
-        self._writer.finish()
-        self._file.close()
+        write_foreign(self.path, self.messages)
 
     def analysed(self, options=None):
         """Close the bag and analyse it."""
@@ -47,14 +39,8 @@ class Bag:
 
 @pytest.fixture
 def bag(tmp_path):
-    """Opens bags by name; all are closed at the end, or earlier with ``close``."""
-    opened = []
-
-    def open_bag(name="run.mcap"):
-        opened.append(Bag(tmp_path / name))
-        return opened[-1]
-
-    return open_bag
+    """Opens bags by name; each is written when it is closed."""
+    return lambda name="run.mcap": Bag(tmp_path / name)
 
 
 @pytest.fixture
