@@ -3,12 +3,11 @@ results built by hand; experiments with a linear chain."""
 
 import numpy as np
 import pytest
-from mcap_ros2.writer import Writer
 
 from support import built_results, linear_chain
 from support.analysed import analysed, experiment
-from undulog.capture import SessionWriter
-from zoo.bags import JOINT_STATE
+from support.joint_runs import write_joints
+from support.written_sessions import joint_state, write_foreign
 
 EPOCH_NS = 1_735_689_600_123_456_789
 
@@ -17,18 +16,12 @@ class Bag:
     """A ROS 2 bag of JointStates."""
 
     def __init__(self, path):
-        self.path = path
-        self._file = path.open("wb")
-        self._writer = Writer(self._file)
-        self._schema = self._writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        self.path, self.messages = path, []
 
     def write(self, topic, t_ns, names, *fields):
-        t_ns = int(t_ns)
-        stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
-        values = zip(("position", "velocity", "effort"), (*fields, (), ()), strict=False)
-        message = {name: [float(v) for v in one] for name, one in values}
-        message |= {"header": {"stamp": stamp, "frame_id": ""}, "name": list(names)}
-        self._writer.write_message(topic, self._schema, message, t_ns, t_ns)
+        values = zip(("position", "velocity", "effort"), fields, strict=False)
+        content = {name: np.asarray(one, dtype=float).tolist() for name, one in values}
+        self.messages.append((topic, int(t_ns), joint_state(int(t_ns), list(names), **content)))
 
     def write_both(self, t_ns, names, command, *response):
         """Write a command and the state at the same time."""
@@ -36,8 +29,7 @@ class Bag:
         self.write("/joint_states", t_ns, names, *response)
 
     def close(self):
-        self._writer.finish()
-        self._file.close()
+        write_foreign(self.path, self.messages)
 
     def analysed(self, options=None):
         """Close the bag and analyse it."""
@@ -47,14 +39,8 @@ class Bag:
 
 @pytest.fixture
 def bag(tmp_path):
-    """Opens bags by name; all are closed at the end, or earlier with ``close``."""
-    opened = []
-
-    def open_bag(name="run.mcap"):
-        opened.append(Bag(tmp_path / name))
-        return opened[-1]
-
-    return open_bag
+    """Opens bags by name; each is written when it is closed."""
+    return lambda name="run.mcap": Bag(tmp_path / name)
 
 
 @pytest.fixture
@@ -94,8 +80,6 @@ def wave():
     return Wave
 
 
-RATE_HZ = 100
-REPORT_EPOCH_NS = 1_767_225_600_000_000_000
 HOSTILE = "<script>alert('x')</script>$\\frac{a}{b$\x00&\"蛇"
 
 
@@ -128,21 +112,14 @@ def recorded(snake, tmp_path_factory):
     """A session of the snake: commands and responses follow the analysis to the letter."""
     path = tmp_path_factory.mktemp("session") / "weak.mcap"
     names = [joint.name for joint in snake.joints]
+    phase = np.pi * np.arange(1601)[:, None] / 100 - np.pi / 6 * np.arange(25)
     amplitude = np.array([joint.command_amplitude_rad or 0.0 for joint in snake.joints])
     gain = np.array([joint.gain.value or 0.0 for joint in snake.joints])
     lag = np.array([joint.lag_rad.value or 0.0 for joint in snake.joints])
-    with SessionWriter(path, session_id="s", epoch_ns=REPORT_EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(16 * RATE_HZ + 1):
-            phase = 2 * np.pi * 0.5 * k / RATE_HZ - np.pi / 6 * np.arange(25)
-            position = amplitude * gain * np.sin(phase - lag)
-            if k == 1400:
-                position[0] = np.nan
-            t_ns = REPORT_EPOCH_NS + k * (1_000_000_000 // RATE_HZ)
-            commands.write(t_ns, amplitude * np.sin(phase))
-            states.write(t_ns, position)
-    return path
+    position = amplitude * gain * np.sin(phase - lag)
+    position[1400, 0] = np.nan
+    when = {"rate_hz": 100, "epoch_ns": built_results.START_NS}
+    return write_joints(path, names, amplitude * np.sin(phase), [position], **when)
 
 
 @pytest.fixture(scope="session")

@@ -1,19 +1,22 @@
 """Small whole recordings of ROS, each written by ``rosbags``."""
 
-import shutil
-
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import StoragePlugin
 
-from support.ros_bags import Filler, message, ticks, write_bag
+from support.ros_bags import (
+    BY_CHUNK,
+    BY_FILE,
+    BY_MESSAGE,
+    Filler,
+    message,
+    ticks,
+    write_bag,
+    write_split,
+)
 
 from .base import Base, files_below
 
 MCAP, DB3 = StoragePlugin.MCAP, StoragePlugin.SQLITE3
-BY_FILE, BY_MESSAGE, BY_CHUNK = (
-    (mode, CompressionFormat.ZSTD)
-    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE)
-)
 BZ2, LZ4 = Writer1.CompressionFormat.BZ2, Writer1.CompressionFormat.LZ4
 FOLDERS = {
     "mcap": {"storage": MCAP},
@@ -37,15 +40,15 @@ def bag_bases(folder):
     bases = []
     for name, options in FOLDERS.items():
         bases.append(_of_folder(write_bag(folder / name, _fill, **options)))
-    bases += [_of_folder(_split(folder / f"split-{name}", FOLDERS[name])) for name in _SPLIT]
+    halves = (lambda bag: _fill(bag, 0, 60), lambda bag: _fill(bag, 60, 60))
+    for name in ("mcap", "mcap-message", "db3", "db3-file"):
+        path = write_split(folder / f"split-{name}", halves, **FOLDERS[name])
+        bases.append(_of_folder(path))
     for name, options in ROS1.items():
         path = write_bag(folder / name, _fill, chunk_size=20_000, **options)
         bases.append(Base("bag file", name, {name: path.read_bytes()}, (name,)))
     bare = {"bare.db3": (folder / "db3" / "db3.db3").read_bytes()}
     return [*bases, Base("bag file", "bare.db3", bare, ("bare.db3",))]
-
-
-_SPLIT = ("mcap", "mcap-message", "db3", "db3-file")
 
 
 def _fill(bag, first=0, count=120):
@@ -67,19 +70,3 @@ def _fill(bag, first=0, count=120):
 def _of_folder(path):
     files = {f"{path.name}/{name}": data for name, data in files_below(path).items()}
     return Base("bag", path.name, files, tuple(files))
-
-
-def _split(path, options):
-    """Write a folder of two parts, as rosbag2 does when a file is full."""
-    second = path.with_name(f"{path.name}-1")
-    write_bag(path, lambda bag: _fill(bag, 0, 60), **options)
-    write_bag(second, lambda bag: _fill(bag, 60, 60), **options)
-    (part,) = (each for each in second.iterdir() if each.name != "metadata.yaml")
-    shutil.copy(part, path / part.name)
-    stated = path / "metadata.yaml"
-    lines = stated.read_text().splitlines(keepends=True)
-    at = next(k for k, line in enumerate(lines) if "relative_file_paths" in line)
-    indent = lines[at + 1].partition("-")[0]
-    lines.insert(at + 2, f"{indent}- {part.name}\n")
-    stated.write_text("".join(lines))
-    return path

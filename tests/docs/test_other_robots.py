@@ -30,8 +30,7 @@ def test_each_block_of_the_page_is_what_is_printed(block, tmp_path):
     for command, *shown in (part.split("\n") for part in block.removeprefix("$ ").split("\n$ ")):
         program, *words = shlex.split(command)
         assert program == "undulog"
-        done = run(sys.executable, "-m", "undulog", *words, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = run(sys.executable, "-m", "undulog", *words, cwd=tmp_path, code=0)
         expected = [line for line in shown if line]
         printed = [line.rstrip() for line in done.stdout.splitlines() if line.strip()]
         if expected[-1] == "...":

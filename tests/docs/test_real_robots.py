@@ -13,8 +13,7 @@ def test_the_page_is_what_its_script_writes(tmp_path):
     if not SHARED.is_dir():
         pytest.skip(f"the real recordings {SHARED.name} are not beside this checkout")
     script = DOCS / "real_robots.py"
-    done = run(sys.executable, str(script), str(SHARED), "--out", str(tmp_path), timeout=1800)
-    assert done.returncode == 0, done.stderr
+    run(sys.executable, str(script), str(SHARED), "--out", str(tmp_path), timeout=1800, code=0)
     page = (tmp_path / "explanation" / "real-robots.md").read_text()
     assert page == (DOCS / "explanation" / "real-robots.md").read_text()
     for picture in (tmp_path / "images").iterdir():

@@ -22,8 +22,7 @@ NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
 @pytest.mark.slow
 def test_the_short_form_reaches_the_conclusions(tmp_path):
     script = ROOT / "docs/study/study.py"
-    done = run(sys.executable, str(script), "--quick", "--out", str(tmp_path), timeout=1800)
-    assert done.returncode == 0, done.stderr
+    run(sys.executable, str(script), "--quick", "--out", str(tmp_path), timeout=1800, code=0)
     verdicts = evaluate(results_of(tmp_path / "rows.parquet"))
     assert {one.conclusion.name for one in verdicts if one.holds is None} == NEEDS_MORE
     assert [one for one in verdicts if one.holds is False] == []

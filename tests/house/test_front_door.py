@@ -48,8 +48,7 @@ def test_no_help_imports_a_package_besides_those_that_lay_it_out():
     # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
     groups = {verb.split()[0] for verb in undulog.VERBS}
     verbs = ["", *sorted(groups | set(undulog.VERBS))]
-    done = python(HELP_OF_EACH, json.dumps(verbs))
-    assert done.returncode == 0, done.stderr
+    done = python(HELP_OF_EACH, json.dumps(verbs), code=0)
     allowed = LAYOUT | {"undulog"} | set(sys.stdlib_module_names)
     others = {verb: set(names) - allowed for verb, names in json.loads(done.stdout).items()}
     assert {verb: names for verb, names in others.items() if names} == {}
@@ -108,9 +107,7 @@ def test_a_missing_extra_is_named():
         "import sys; sys.modules['pybullet'] = sys.modules['mujoco'] = None; import undulog;"
         "sys.exit(undulog.run(['sim', 'run', 'flat', '-o', 'never.mcap']))"
     )
-    done = python(code)
-    assert done.returncode == 2, done.stderr
-    assert "the extra 'sim' brings it: pip install 'pybullet>=3.2.7'" in done.stderr
+    assert "the extra 'sim' brings it: pip install 'pybullet>=3.2.7'" in python(code, code=2).stderr
 
 
 def test_info_names_versions(command):
@@ -135,8 +132,9 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
         " is_extended_id=False, data=[k], channel=0))\n"
     )
     assert python(script).returncode == 0
-    done = processes.undulog("import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+    done = processes.undulog(
+        "import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT, code=0
+    )
     assert "5 CAN frames" in done.stdout
 
 
@@ -156,5 +154,4 @@ def test_reading_a_robot_loads_python_can_only_when_it_is_used():
         "assert 'cantools' in sys.modules; assert 'can' not in sys.modules;"
         "import cantools; assert issubclass(cantools.tester.Tester, object)"
     )
-    done = python(code)
-    assert done.returncode == 0, done.stderr
+    python(code, code=0)

@@ -15,16 +15,10 @@ import pytest
 
 from support import processes
 from support.paths import ROOT
+from support.processes import tracked
 
 FOLDERS = ("analysis", "capture", "replay", "sim")
 BUILD = [sys.executable, "-m", "hatchling", "build"]
-
-
-def tracked(*patterns):
-    done = processes.run("git", "ls-files", "--", *patterns, cwd=ROOT)
-    if done.returncode:
-        pytest.skip("not a git checkout: the list of tracked files is unknown")
-    return [ROOT / name for name in done.stdout.splitlines()]
 
 
 def run(*words, cwd=ROOT, fails=False, **environment):

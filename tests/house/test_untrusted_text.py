@@ -224,12 +224,10 @@ def test_pages_have_no_markup_from_names(folder, run, command):
     assert text.count("<script>alert") == 0
 
 
-def test_notebooks_show_names_as_text(folder):
+def test_notebooks_show_names_as_text(folder, opened):
     from undulog.analysis.session.analyse import analyse_session
-    from undulog.capture import Session
 
-    with Session.open(folder / "a.mcap") as session:
-        shown = analyse_session(session)._repr_html_()
+    shown = analyse_session(opened(folder / "a.mcap"))._repr_html_()
     assert "<script" not in shown
     assert "&lt;script&gt;" in shown
     assert raw(shown) == set()

@@ -7,6 +7,7 @@ import pytest
 
 import undulog as front
 from support.twin_chains import chain, wave
+from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.replay.reproduce import compare_logs
 
@@ -84,12 +85,10 @@ def commands(room):
     altered = values.copy()
     altered[200, 3] += 1e-3
     facts = {"epoch_ns": int(found.t_ns[0][0]), "robot": robot}
+    facts["begin"] = lambda writer: writer.attach("scenario.toml", "application/toml", world)
     for name, rows in (("plain", values), ("altered", altered)):
-        with SessionWriter(room / f"{name}.mcap", session_id=name, **facts) as writer:
-            writer.attach("scenario.toml", "application/toml", world)
-            channel = writer.joint_state("/joint_commands", found.names, unit="rad")
-            for t_ns, row in zip(found.t_ns[0].tolist(), rows, strict=True):
-                channel.write(t_ns, row)
+        topics = {"/joint_commands": (found.names, "rad", rows)}
+        write_topics(room / f"{name}.mcap", found.t_ns[0], topics, **facts)
     return room
 
 

@@ -2,18 +2,12 @@
 
 import pytest
 
-from support.ros_bags import NAMES, Filler, ticks, write_bag
-from undulog.capture import Session
+from support.ros_bags import NAMES, Filler, filling, write_bag
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    def fill(bag):
-        own = Filler(bag)
-        for tick in ticks():
-            own.controller(*tick)
-
-    return write_bag(tmp_path_factory.mktemp("control") / "bag", fill)
+    return write_bag(tmp_path_factory.mktemp("control") / "bag", filling(Filler.controller))
 
 
 def test_a_view_shows_the_joints_of_a_controller(bag, tmp_path, report_of):
@@ -26,10 +20,9 @@ def test_a_view_shows_the_joints_of_a_controller(bag, tmp_path, report_of):
     assert both["sessions"][1]["joints_compared"] == list(NAMES)
 
 
-def test_a_plan_is_made_around_commands_found_by_type(bag, tmp_path, report_of):
+def test_a_plan_is_made_around_commands_found_by_type(bag, tmp_path, report_of, opened):
     files = report_of("plan", "reversal", "--like", bag, "-o", tmp_path / "plan", "--runs", 2)
-    with Session.open(files["files"][0]) as session:
-        assert session.joints("/joint_commands").names == NAMES
+    assert opened(files["files"][0]).joints("/joint_commands").names == NAMES
 
 
 def test_what_drives_never_guesses_commands(bag, tmp_path, command, report_of):

@@ -115,6 +115,14 @@ def until_the_body_stands(shown, rgb):
     return until(stands)
 
 
+@pytest.fixture
+def shown(view, long_file, rgb):
+    """The command while it converts, with the body in its viewer."""
+    shown = view(long_file)
+    until_the_body_stands(shown, rgb)
+    return shown
+
+
 def viewer_of(shown):
     """Process id of the viewer."""
     pid = shown.process.pid
@@ -150,35 +158,24 @@ def test_a_tab_that_was_asked_for_comes_to_the_front_with_its_numbers(view, long
     assert shown.picture(rgb, name).std() > 5  # a view behind a tab has no picture
 
 
-def test_closing_the_window_while_it_is_converted_ends_the_command(view, long_file, rgb):
-    shown = view(long_file)
-    until_the_body_stands(shown, rgb)
+def test_closing_the_window_while_it_is_converted_ends_the_command(shown):
     shown.client.run_command("ui.quit")
-    code, out, err = shown.finish()
-    assert (code, out, err) == (0, "", "")
+    assert shown.finish() == (0, "", "")
 
 
-def test_an_interrupt_while_it_is_converted_ends_the_command(view, long_file, rgb):
-    shown = view(long_file)
-    until_the_body_stands(shown, rgb)
+def test_an_interrupt_while_it_is_converted_ends_the_command(shown):
     viewer = viewer_of(shown)
     shown.process.send_signal(signal.SIGINT)
-    code, out, err = shown.finish()
-    assert (code, out, err) == (0, "", "")
+    assert shown.finish() == (0, "", "")
     assert not Path(f"/proc/{viewer}").exists()
 
 
-def test_a_viewer_that_is_killed_is_reported(view, long_file, rgb):
-    shown = view(long_file)
-    until_the_body_stands(shown, rgb)
+def test_a_viewer_that_is_killed_is_reported(shown):
     os.kill(viewer_of(shown), signal.SIGKILL)
-    code, out, err = shown.finish()
-    assert (code, out, err) == (1, "", "error: the Rerun viewer was ended by signal 9\n")
+    assert shown.finish() == (1, "", "error: the Rerun viewer was ended by signal 9\n")
 
 
-def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(view, long_file, rgb):
-    shown = view(long_file)
-    until_the_body_stands(shown, rgb)
+def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(shown):
     viewer = viewer_of(shown)
     freeze(viewer)
 
@@ -191,8 +188,7 @@ def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(view, long_file, rgb):
     time.sleep(5.0)
     assert megabytes() < before + 20.0
     shown.process.send_signal(signal.SIGTERM)
-    code, out, err = shown.finish()
-    assert (code, out, err) == (0, "", "")
+    assert shown.finish() == (0, "", "")
     assert not Path(f"/proc/{viewer}").exists()
 
 

@@ -68,8 +68,7 @@ class Page:
 
     def picture(self):
         shot = self._browser.call("Page.captureScreenshot", format="png")["data"]
-        with Image.open(io.BytesIO(base64.b64decode(shot))) as image:
-            return np.asarray(image.convert("RGB")).astype(int)
+        return golden_pictures.load(io.BytesIO(base64.b64decode(shot)))
 
     def rest(self, patience_s=60.0):
         """A picture that is the same as the two before."""
@@ -87,9 +86,7 @@ class Page:
 
     def click(self, x, y):
         for kind in ("mousePressed", "mouseReleased"):
-            self._browser.call(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
-            )
+            self._browser.mouse(kind, x, y, clicks=1)
 
     def press(self, key, code, *, shift=False, control=False):
         for kind in ("rawKeyDown", "keyUp"):

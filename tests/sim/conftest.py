@@ -37,13 +37,19 @@ def make_robot():
 def make_uneven(make_robot):
     """Chain of links that differ in every respect, so that no mix-up goes unseen."""
 
-    def build(links):
-        robot = make_robot(links)
-        uneven = tuple(
-            Link(name, 0.05 + 0.01 * i, 0.02, 0.1 + 0.02 * i, (3e-5 + i * 1e-6, 5e-5, 6e-5))
-            for i, name in enumerate(link.name for link in robot.links)
-        )
-        return dataclasses.replace(robot, links=uneven)
+    def build(links, **options):
+        robot = make_robot(links, **options)
+        uneven, joints = [], []
+        for i, link in enumerate(robot.links):
+            inertia = (5e-5 + 1e-6 * i, 6e-5, 6e-5 + 1e-5 * i)
+            size = (0.05 + 0.01 * i, 0.02 + 1e-3 * i)
+            uneven.append(Link(link.name, *size, 0.1 + 0.02 * i, inertia))
+        for i, joint in enumerate(robot.joints):
+            own = {"stall_torque": 0.3 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
+            own["static_friction"] = 0.05 * (i % 3 == 0)
+            servo = dataclasses.replace(joint.servo, **own)
+            joints.append(dataclasses.replace(joint, servo=servo))
+        return dataclasses.replace(robot, links=tuple(uneven), joints=tuple(joints))
 
     return build
 

@@ -1,10 +1,12 @@
-"""Frames as python-can's messages and back, and streams cut into pieces."""
+"""Random frames, frames as python-can's messages and back, and streams cut into pieces."""
 
 import itertools
+from contextlib import contextmanager
 
 import can
 import numpy as np
 
+from support.processes import repeating
 from undulog.capture.log.messages import frames as fr
 
 
@@ -33,16 +35,8 @@ def can_message(frame, **options):
 def received(bus, count):
     """The next messages of a bus of python-can, and the frames in them."""
     messages = [bus.recv(60) for _ in range(count)]
-    bus.shutdown()
     assert all(messages)
-    frames = fr.empty_frames(count)
-    frames["id_flags"] = [
-        m.arbitration_id | m.is_extended_id * fr.EXTENDED_FLAG | m.is_remote_frame * fr.REMOTE_FLAG
-        for m in messages
-    ]
-    frames["dlc"] = [m.dlc for m in messages]
-    frames["data"] = [list(bytes(m.data).ljust(8, b"\0")) for m in messages]
-    return messages, frames
+    return messages, frames_of(messages)
 
 
 def cut_at_random(stream, seed):
@@ -54,11 +48,60 @@ def cut_at_random(stream, seed):
 
 
 def frames_of(messages):
-    """Return messages of python-can as frames, with the robot's times in whole microseconds."""
+    """Return messages of python-can as frames, with their times in whole microseconds."""
     frames = fr.empty_frames(len(messages))
     for frame, message in zip(frames, messages, strict=True):
         kind = message.is_extended_id * fr.EXTENDED_FLAG | message.is_error_frame * fr.ERROR_FLAG
+        kind |= message.is_remote_frame * fr.REMOTE_FLAG
         frame["id_flags"], frame["dlc"] = message.arbitration_id | kind, message.dlc
-        frame["data"][: message.dlc] = list(message.data)
+        frame["data"] = list(bytes(message.data).ljust(8, b"\0"))
         frame["t_device_ns"] = round(message.timestamp * 1e6) * 1000
     return frames
+
+
+def identifiers(rng, count):
+    """Random identifiers, three in ten of them of 29 bits."""
+    wide, narrow = rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG, rng.integers(0, 2**11, count)
+    return np.where(rng.random(count) < 0.3, wide, narrow)
+
+
+def traffic(count, remote_share=0.02):
+    """Random frames of both identifier widths and all lengths, a remote request now and then."""
+    rng = np.random.default_rng(count)
+    frames = fr.empty_frames(count)
+    remote = rng.random(count) < remote_share
+    frames["id_flags"] = identifiers(rng, count) | (remote * fr.REMOTE_FLAG)
+    frames["dlc"] = rng.integers(0, 9, count)
+    frames["data"] = rng.integers(0, 256, (count, 8))
+    frames["data"][(np.arange(8) >= frames["dlc"][:, None]) | remote[:, None]] = 0
+    steps_ns = rng.integers(1, 9000, count) * 1000
+    frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(steps_ns)
+    return frames
+
+
+def fd_traffic(count):
+    """Random CAN FD frames of both identifier widths, all lengths, and some with the fast rate."""
+    rng = np.random.default_rng(count)
+    frames = fr.empty_fd_frames(count)
+    frames["id_flags"] = identifiers(rng, count)
+    frames["fd_flags"] = np.where(rng.random(count) < 0.5, fr.FD_BRS, 0)
+    lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
+    frames["len"] = np.array(lengths)[rng.integers(0, 16, count)]
+    frames["data"] = rng.integers(0, 256, (count, 64))
+    frames["data"][np.arange(64) >= frames["len"][:, None]] = 0
+    return frames
+
+
+def same(found, truth):
+    """Return whether two lots of frames agree in everything but times."""
+    classic = truth.dtype == fr.empty_frames(0).dtype
+    names = ("id_flags", "dlc", "data") if classic else ("id_flags", "len", "fd_flags", "data")
+    return len(found) == len(truth) and all(np.array_equal(found[n], truth[n]) for n in names)
+
+
+@contextmanager
+def speaking(channel, each):
+    """Somebody on a virtual bus of python-can, every 10 ms."""
+    bus = can.Bus(interface="virtual", channel=channel)
+    with bus, repeating(lambda: each(bus), 0.01):
+        yield bus

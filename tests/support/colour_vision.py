@@ -82,7 +82,12 @@ def difference(one, other):
     return float(np.sqrt(sum(p**2 for p in parts) + r_t * parts[1] * parts[2]))
 
 
+def luminance(color):
+    """Relative luminance of a colour (IEC 61966-2-1)."""
+    return linear(color) @ (0.2126, 0.7152, 0.0722)
+
+
 def contrast(one, other):
     """Contrast ratio of two colours (WCAG 2.2)."""
-    light = sorted(linear(c) @ (0.2126, 0.7152, 0.0722) + 0.05 for c in (one, other))
-    return light[1] / light[0]
+    dark, light = sorted(luminance(color) + 0.05 for color in (one, other))
+    return light / dark

@@ -5,10 +5,9 @@ import json
 import socket
 import subprocess
 import sys
-import threading
 import time
 
-from support.processes import start, wait_for
+from support.processes import process, repeating, wait_for
 from undulog.capture.common.errors import DataError
 
 PATIENCE_S = 60.0
@@ -27,23 +26,9 @@ def echo(request):
     return {"got": dict(request)}
 
 
-@contextlib.contextmanager
 def polled(server, pause_s=0.001):
     """Poll a server in a thread, as the recorder's loop does."""
-    ended = threading.Event()
-
-    def loop():  # an exception in here fails the test: pytest warns of it
-        while not ended.is_set():
-            server.poll()
-            time.sleep(pause_s)
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+    return repeating(server.poll, pause_s)
 
 
 def connected(server):
@@ -99,10 +84,6 @@ def started_recorder(path, extra="", first="ready\n"):
         "    server.poll()\n"
         "    time.sleep(0.005)\n"
     )
-    process = start(sys.executable, "-c", code, stdin=subprocess.PIPE)
-    try:
-        assert process.stdout.readline() == first
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    with process(sys.executable, "-c", code, stdin=subprocess.PIPE) as running:
+        assert running.stdout.readline() == first
+        yield running

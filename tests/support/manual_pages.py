@@ -5,14 +5,13 @@ import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from support.paths import DOCS
-from support.processes import process, undulog, wait_for
+from support.processes import process, run, undulog, wait_for
 
 _INCLUDE = re.compile(r"^```\{include\} (\S+)\n```$", re.MULTILINE)
 _BLOCK = re.compile(r"^```(console|\{code-block\} \w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -125,14 +124,7 @@ def walk(page: str, folder: Path) -> None:
                 recorder = opened(step)
                 wait_for(lambda: _connected(options), "the recorder", alive=(recorder,))
             else:
-                done = subprocess.run(
-                    ["bash", "-c", step.line],
-                    check=False,
-                    capture_output=True,
-                    text=True,
-                    timeout=PATIENCE_S,
-                    **options,
-                )
+                done = run("bash", "-c", step.line, timeout=PATIENCE_S, **options)
                 assert done.returncode in step.codes, (step.line, done.stderr)
                 if step.shown:
                     assert shows(step.shown, done.stdout), f"{step.line}\n{done.stdout}"

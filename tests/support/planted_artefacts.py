@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from support.joint_runs import write_joints
 from undulog.analysis.signals.artefacts import find_artefacts
 from undulog.analysis.signals.columns import read_columns
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import Session, load_robot
 
-EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100
 DURATION_S = 20.0
 OMEGA = np.pi  # 0.5 Hz
@@ -51,16 +51,10 @@ class Snake:
 
     def write(self, path):
         """Write a session with the robot's description."""
+        states = (self.position, self.velocity, self.effort)
+        facts = {"robot": self.robot, "scenario": "[servo]\nstall_torque = 1.5\n"}
         names = self.robot.joint_names
-        with SessionWriter(path, session_id="planted", epoch_ns=EPOCH_NS, robot=self.robot) as w:
-            w.attach("scenario.toml", "application/toml", b"[servo]\nstall_torque = 1.5\n")
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-            for k in range(self.t.size):
-                t_ns = EPOCH_NS + k * (10**9 // RATE_HZ)
-                commands.write(t_ns, self.command[k])
-                states.write(t_ns, self.position[k], self.velocity[k], self.effort[k])
-        return path
+        return write_joints(path, names, self.command, states, rate_hz=RATE_HZ, **facts)
 
 
 def artefacts(path):

@@ -5,27 +5,42 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
+from support.paths import ROOT
+
 UNDULOG = (sys.executable, "-m", "undulog")
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
 
-def run(*words, **options):
-    """Run a process to its end; its exit code is for the caller to check."""
+def run(*words, code=None, **options):
+    """Run a process to its end; its exit code is ``code``, or for the caller to check."""
     options = PIPES | {"timeout": 300} | options
-    return subprocess.run([str(word) for word in words], check=False, **options)
+    done = subprocess.run([str(word) for word in words], check=False, **options)
+    assert code in (None, done.returncode), (words, done)
+    return done
 
 
 def undulog(*words, **options):
     return run(*UNDULOG, *words, **options)
 
 
-def python(code, *words, **options):
-    return run(sys.executable, "-c", code, *words, **options)
+def python(program, *words, **options):
+    return run(sys.executable, "-c", program, *words, **options)
+
+
+def tracked(*patterns):
+    """Return the files that git tracks; skips where there is no checkout."""
+    import pytest
+
+    done = run("git", "ls-files", "--", *patterns, cwd=ROOT)
+    if done.returncode:
+        pytest.skip("not a git checkout: the list of tracked files is unknown")
+    return [ROOT / name for name in done.stdout.splitlines()]
 
 
 def start(*words, **options):
@@ -33,8 +48,8 @@ def start(*words, **options):
     return subprocess.Popen([str(word) for word in words], **(PIPES | options))
 
 
-def python_started(code, *words, **options):
-    return start(sys.executable, "-c", code, *words, **options)
+def python_started(program, *words, **options):
+    return start(sys.executable, "-c", program, *words, **options)
 
 
 @contextmanager
@@ -74,6 +89,27 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
         each()
         time.sleep(0.005)
     return found
+
+
+@contextmanager
+def repeating(step, pause_s):
+    """Call a function again and again in a thread, until the end of the block.
+
+    An exception in it fails the test: pytest warns of it.
+    """
+    ended = threading.Event()
+
+    def loop():
+        while not ended.wait(pause_s):
+            step()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def alive(pid):

@@ -9,9 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 from mcap.reader import make_reader
 
-from support import processes
 from support.paths import ROOT
-from support.processes import UNDULOG, wait_for
+from support.processes import UNDULOG, process, wait_for
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 
@@ -24,24 +23,18 @@ def command(output, *arguments):
 @contextmanager
 def recording(output, *arguments, env=None, floor="0", before=()):
     """Run a recorder in another process; it is running when the block begins."""
-    process = processes.start(
-        *before, *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
-    )
-    try:
+    words = (*before, *command(output, *arguments), "--floor", floor, "--json")
+    with process(*words, cwd=ROOT, env=env) as running:
         control = output.with_name("control.sock")
-        wait_for(lambda: control.exists() or process.poll() is not None, "the recorder")
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        wait_for(lambda: control.exists() or running.poll() is not None, "the recorder")
+        yield running
 
 
-def ended(process, number=None):
+def ended(running, number=None):
     """The report of a recorder that ends, after a signal if one is given, and its errors."""
     if number is not None:
-        process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+        running.send_signal(number)
+    out, err = running.communicate(timeout=60)
     assert "Traceback" not in err, err
     return json.loads(out) if out else None, err
 

@@ -1,11 +1,12 @@
 """Bags written by rosbags itself: joints in the messages of ros2_control, with a known response."""
 
+import shutil
 from dataclasses import dataclass
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -15,6 +16,12 @@ GAIN, LAG = np.array([0.95, 0.9, 0.85]), np.array([0.1, 0.2, 0.3])
 OMEGA, AMPLITUDE = 2 * np.pi * 0.8, 0.4
 HOLD_S = 0.1
 """From the stamp of a streamed trajectory to its point."""
+
+BY_FILE, BY_MESSAGE, BY_CHUNK = (
+    (mode, CompressionFormat.ZSTD)
+    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE)
+)
+"""Compressions of a bag of ROS 2."""
 
 POINT = "trajectory_msgs/JointTrajectoryPoint"
 MULTI = "trajectory_msgs/MultiDOFJointTrajectoryPoint"
@@ -136,6 +143,21 @@ def write_bag(
     return path
 
 
+def write_split(path, fills, **options):
+    """Write a folder of two parts, as rosbag2 does when a file is full."""
+    write_bag(path, fills[0], **options)
+    second = write_bag(path.with_name(f"{path.name}_1"), fills[1], **options)
+    (part,) = (each for each in second.iterdir() if each.name != "metadata.yaml")
+    part.rename(path / part.name)
+    shutil.rmtree(second)
+    stated = path / "metadata.yaml"
+    lines = stated.read_text().splitlines()
+    at = next(k for k, line in enumerate(lines) if "relative_file_paths" in line) + 1
+    lines.insert(at + 1, f"{lines[at].partition('-')[0]}- {part.name}")
+    stated.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def commanded(t_s):
     return AMPLITUDE * np.sin(OMEGA * t_s - np.arange(3))
 
@@ -159,11 +181,11 @@ class Filler:
     def noisy(self, t_s):
         return answered(t_s) + self.draw.normal(0, 1e-3, 3)
 
-    def state(self, t_ns, t_s, topic="/joint_states", positions=None):
+    def state(self, t_ns, t_s, topic="/joint_states", positions=None, names=NAMES):
         store = self.bag.store
-        values = self.noisy(t_s) if positions is None else positions
+        values = self.noisy(t_s) if positions is None else np.array(positions, float)
         head = header(store, t_ns)
-        sample = message(store, STATE, header=head, name=list(NAMES), position=values)
+        sample = message(store, STATE, header=head, name=list(names), position=values)
         self.bag.write(topic, t_ns, sample)
 
     def controller(self, t_ns, t_s, topic="/arm/controller_state", names=("reference", "feedback")):
@@ -217,3 +239,14 @@ class Filler:
 
     def array(self, t_ns, t_s, topic="/forward/commands"):
         self.bag.write(topic, t_ns, message(self.bag.store, ARRAY, data=commanded(t_s)))
+
+
+def filling(write, seconds=10.0, rate=100):
+    """A fill for :func:`write_bag`; ``write`` gets a filler and the times of each tick."""
+
+    def fill(bag):
+        own = Filler(bag)
+        for tick in ticks(seconds, rate):
+            write(own, *tick)
+
+    return fill

@@ -1,7 +1,5 @@
 """A world whose parameters are hidden, a session of it, and the twin fitted to that."""
 
-import json
-
 import numpy as np
 from scipy.signal import lfilter
 
@@ -35,11 +33,8 @@ def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), 
     return folder
 
 
-def fitted(room, capsys, *words, source="run.mcap"):
-    command = ["sim", "fit", str(room / source), "--on", f"twin:{room / 'nominal.toml'}"]
-    capsys.readouterr()
-    assert front.run([*command, *words, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+def fitted(room, report_of, *words, source="run.mcap"):
+    report = report_of("sim", "fit", room / source, "--on", f"twin:{room / 'nominal.toml'}", *words)
     return report, {(one["name"], one["module"]): one for one in report["parameters"]}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.joint_runs import turns
-from undulog.capture.log.write.writer import SessionWriter
+from support.written_topics import write_topics
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,5 @@ def test_the_record_decides_no_end_and_the_note_says_so(motion_without_robot, co
 def motion_without_robot(tmp_path):
     """A wave along joints that only the order of the file sorts."""
     angles = 0.3 * np.real(turns(0.9, 500) * np.exp(-0.7j * np.arange(5)))
-    path, names = tmp_path / "s.mcap", [f"j{k}" for k in range(5)]
-    with SessionWriter(path, session_id="s", epoch_ns=0) as writer:
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k, row in enumerate(angles):
-            states.write(k * 20_000_000, row)
-    return path
+    topics = {"/joint_states": ([f"j{k}" for k in range(5)], "rad", angles)}
+    return write_topics(tmp_path / "s.mcap", np.arange(500) * 20_000_000, topics, epoch_ns=0)

@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import StoragePlugin
 
 from support import durable_child as recorder
 from support.analysed import analysed as analysed_session
@@ -21,7 +21,7 @@ from support.bucket import s3_bucket
 from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.processes import undulog
-from support.ros_bags import Filler, ticks, write_bag
+from support.ros_bags import BY_FILE, BY_MESSAGE, Filler, filling, ticks, write_bag
 from support.written_sessions import joint_state, write_foreign, write_session
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
 from undulog.capture import Session
@@ -189,7 +189,7 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
 
 
 @pytest.mark.parametrize("left", [None, b""], ids=["missing", "empty"])
-def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left):
+def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     path = tmp_path / "run.mcap"
     killed_after([sys.executable, recorder.__file__, str(path), "{}"], 0.3)
     path.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
@@ -201,8 +201,7 @@ def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left):
     assert (row.path, row.session_id, row.status) == ("run.mcap", "killed", "not analysed")
     assert row.damage.endswith("undulog log recover run.mcap")
     assert [*row.topics] == sorted(recorder.TOPICS)
-    with Session.open(path) as session:
-        assert session.session_id == row.session_id
+    assert opened(path).session_id == row.session_id
     (tmp_path / "run.mcap.wal" / "def-000001.seg").write_bytes(b"no segment")
     for segment in (tmp_path / "run.mcap.wal").glob("0*.seg"):
         segment.unlink()
@@ -232,26 +231,27 @@ def test_parts_of_a_session_are_one_row(tmp_path):
         assert rows.start_ns["run.mcap"] == session.start_ns
 
 
-MESSAGES = (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
-FILES = (CompressionMode.FILE, CompressionFormat.ZSTD)
+KINDS = {
+    "one.bag": {},
+    "plain": {},
+    "messages": {"compression": BY_MESSAGE},
+    "sql": {"storage": StoragePlugin.SQLITE3},
+    "files": {"storage": StoragePlugin.SQLITE3, "compression": BY_FILE},
+}
+BAGS = ["alone.db3", *sorted(f"day/{name}" for name in KINDS)]
 
 
-def _fill(bag):
-    fill = Filler(bag)
-    for tick in ticks(1.0):
-        fill.controller(*tick)
-        fill.state(*tick)
+def _joints(own, *tick):
+    own.controller(*tick)
+    own.state(*tick)
 
 
 @pytest.fixture
 def bags(tmp_path):
     """A bag of each kind, and folders of other tools with a metadata.yaml."""
     (tmp_path / "day").mkdir()
-    write_bag(tmp_path / "day/one.bag", _fill)
-    write_bag(tmp_path / "day/plain", _fill)
-    write_bag(tmp_path / "day/messages", _fill, compression=MESSAGES)
-    write_bag(tmp_path / "day/files", _fill, storage=StoragePlugin.SQLITE3, compression=FILES)
-    write_bag(tmp_path / "day/sql", _fill, storage=StoragePlugin.SQLITE3)
+    for name, how in KINDS.items():
+        write_bag(tmp_path / "day" / name, filling(_joints, 1.0), **how)
     shutil.copy(tmp_path / "day/sql/sql.db3", tmp_path / "alone.db3")
     for name in ("tool", "tool/deep"):
         (tmp_path / name).mkdir()
@@ -260,7 +260,6 @@ def bags(tmp_path):
     return tmp_path
 
 
-BAGS = ["alone.db3", *(f"day/{name}" for name in ("files", "messages", "one.bag", "plain", "sql"))]
 SESSIONS = ["tool/deep/run.mcap", "tool/run.mcap"]
 
 
@@ -299,12 +298,11 @@ def test_bags_are_opened_again_only_when_a_file_of_theirs_has_changed(bags):
     assert catalog.find("damage is not null").path.to_list() == ["day/sql/sql.db3"]
 
 
-def test_a_bag_alone_and_damaged_ones(bags):
+def test_a_bag_alone_and_damaged_ones(bags, opened):
     catalog = Catalog(str(bags / "day/plain"))
     catalog.scan()
     assert catalog.find().path.to_list() == ["."]
-    with Session.open(bags / "day/plain") as session:
-        assert catalog.find().session_id.to_list() == [session.session_id]
+    assert catalog.find().session_id.to_list() == [opened(bags / "day/plain").session_id]
     (bags / "day/sql/sql.db3").unlink()
     for name in ("alone.db3", "day/one.bag"):
         os.truncate(bags / name, 3000)
@@ -364,17 +362,8 @@ def test_analyses_of_bags_are_made_on_request(bags):
     assert rows.path.to_list() == ["day/messages", "day/one.bag"]
 
 
-KINDS = {
-    "walk.bag": {},
-    "walk": {},
-    "messages": {"compression": MESSAGES},
-    "sql": {"storage": StoragePlugin.SQLITE3},
-    "files": {"storage": StoragePlugin.SQLITE3, "compression": FILES},
-}
-
-
 @pytest.mark.parametrize("name", KINDS)
-def test_the_id_of_a_bag_is_of_its_content(tmp_path, name):
+def test_the_id_of_a_bag_is_of_its_content(tmp_path, name, opened):
     """Same name, times, topics and sizes of all messages, and the same begin and end."""
 
     def fill(bag, day):
@@ -393,14 +382,13 @@ def test_the_id_of_a_bag_is_of_its_content(tmp_path, name):
     first, second, copied = catalog.find().session_id
     assert first == copied != second
     for path, row in catalog.find().set_index("path").iterrows():
-        with Session.open(tmp_path / path) as session:
-            assert session.session_id == row.session_id
+        assert opened(tmp_path / path).session_id == row.session_id
     assert catalog.analyse([f"1/{name}"]).keys() <= {f"1/{name}"}
     analysed = catalog.find("status = 'analysed'").path.to_list()
     assert analysed in ([], [f"1/{name}"])
 
 
-def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path):
+def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path, opened):
     logs = [
         [
             ("/joint_states", 10**18 + k * 10**7, joint_state(0, ["a"], [k * step]))
@@ -415,8 +403,7 @@ def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path):
     catalog.scan()
     ids = catalog.find().set_index("path").session_id
     assert ids["0/run.mcap"] == ids["2/run2.mcap"] != ids["1/run.mcap"]
-    with Session.open(tmp_path / "2/run2.mcap") as session:
-        assert session.session_id == ids["2/run2.mcap"]
+    assert opened(tmp_path / "2/run2.mcap").session_id == ids["2/run2.mcap"]
 
 
 def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(lab):
@@ -491,8 +478,7 @@ def test_the_command(lab):
     text = undulog("catalog", lab).stdout
     assert "plain.mcap" in text
     assert "2 rows; 2 sessions, 0 files read now" in text
-    done = undulog("catalog", lab, "--joints", "-o", lab / "joints.csv")
-    assert done.returncode == 0, done.stderr
+    undulog("catalog", lab, "--joints", "-o", lab / "joints.csv", code=0)
     assert len(pd.read_csv(lab / "joints.csv")) > 1
     query = "select robot, count(*) as n from catalog group by robot"
     assert undulog("catalog", lab, "--sql", query).returncode == 0

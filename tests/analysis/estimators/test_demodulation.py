@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from support.written_topics import write_topics
 from undulog.analysis.estimators.demodulation import Phase, cycles_of, demodulate
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.session.cycles import response_over_time
 from undulog.analysis.signals.columns import read_columns
-from undulog.capture import Session, SessionWriter
+from undulog.capture import Session
 
 T = np.arange(6000) / 100
 
@@ -125,16 +126,15 @@ def test_too_few_cycles_have_no_interval():
 
 def over_time(path, phi):
     """What a session of two joints tells whose controller logged this phase."""
-    with SessionWriter(path, session_id="phase", epoch_ns=0) as writer:
-        commands = writer.joint_state("/joint_commands", ["j1", "j2"], unit="rad")
-        states = writer.joint_state("/joint_states", ["j1", "j2"], unit="rad")
-        gait = writer.joint_state("/gait", ["plane.A", "plane.omega", "plane.phase"], unit="rad")
-        turned = phase_of(OMEGA)[:, None] - np.array([0.0, 1.0])
-        for k, t_s in enumerate(T.tolist()):
-            t_ns = round(t_s * 1e9)
-            commands.write(t_ns, 0.3 * np.sin(turned[k]))
-            states.write(t_ns, 0.3 * GAIN[k] * np.sin(turned[k] - LAG[k]))
-            gait.write(t_ns, [0.3, OMEGA[k], phi[k]])
+    turned = phase_of(OMEGA)[:, None] - np.array([0.0, 1.0])
+    answer = 0.3 * GAIN[:, None] * np.sin(turned - LAG[:, None])
+    gait = np.stack([np.full_like(phi, 0.3), OMEGA, phi], axis=1)
+    topics = {
+        "/joint_commands": (["j1", "j2"], "rad", 0.3 * np.sin(turned)),
+        "/joint_states": (["j1", "j2"], "rad", answer),
+        "/gait": (["plane.A", "plane.omega", "plane.phase"], "rad", gait),
+    }
+    write_topics(path, np.arange(T.size) * 10_000_000, topics, epoch_ns=0)
     with Session(path) as session:
         columns = read_columns(session, "/joint_commands", "/joint_states", lambda _: None)
         return response_over_time(session, columns, (), lambda _: None)

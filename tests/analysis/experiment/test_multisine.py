@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from support.joint_runs import EPOCH_NS, turns, write_joints
-from undulog.capture import Session, SessionWriter
+from undulog.capture import Session
 
 RATE_HZ = 100
 NAMES = ("a", "b")
@@ -42,18 +42,11 @@ def drive(plans, folder, *, square=0.0, cube=0.0, mix=None, record=None):
         y += 0.001 * rng.normal(size=y.shape)
         path = folder / f"r{len(list(folder.glob('*.mcap'))):02d}.mcap"
         facts = facts if record is None else record
-        start_ns = EPOCH_NS + k * 60_000_000_000
-        meta = {"settle_s": facts["settle_s"]} if facts else {}
-        with SessionWriter(path, session_id=path.stem, epoch_ns=start_ns, metadata=meta) as writer:
-            if facts:
-                writer.note("undulog.plan", facts)
-            sent = writer.joint_state("/joint_commands", NAMES, unit="rad")
-            measured = writer.joint_state("/joint_states", NAMES, unit="rad")
-            for i in range(len(y)):
-                sent.write(start_ns + i * 10**9 // RATE_HZ, asked[i])
-                measured.write(start_ns + i * 10**9 // RATE_HZ, y[i])
-            writer.set_verdict("good")
-        files.append(path)
+        when = {"rate_hz": RATE_HZ, "epoch_ns": EPOCH_NS + k * 60_000_000_000}
+        if facts:
+            when |= {"metadata": {"settle_s": facts["settle_s"]}}
+            when |= {"begin": lambda writer, facts=facts: writer.note("undulog.plan", facts)}
+        files.append(write_joints(path, NAMES, asked, [y], verdict="good", **when))
     return files
 
 

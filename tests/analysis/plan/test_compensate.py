@@ -1,6 +1,5 @@
 """Compensation: on linear chains its commands are known in closed form."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -8,7 +7,6 @@ import kick_tables
 import numpy as np
 import pytest
 
-import undulog
 from support import linear_chain
 from support.compensating import Wave, gait_run
 from support.kick_runs import kicked
@@ -173,32 +171,29 @@ def test_what_does_not_fit_is_refused():
         compensation(EXACT, BASE, None, target_gain=0.0)
 
 
-def test_by_the_commands_of_the_manual(tmp_path, capsys):
+def test_by_the_commands_of_the_manual(tmp_path, command, report_of):
     """Kicks, analysis, compensation, its recording, and again with --after."""
     paths = linear_chain.kicked(tmp_path)
     kicks = tmp_path / "kicks.json"
-    assert undulog.run(["analyse", *map(str, paths), "-o", str(kicks)]) == 0
-    words = ["plan", "compensate", str(kicks), "--like", str(paths[0]), "--json"]
+    command("analyse", *paths, "-o", kicks)
+    words = ("plan", "compensate", kicks, "--like", paths[0])
     found = []
     for k in range(2):
-        more = ["--after", str(tmp_path / f"driven{k - 1}.mcap")] if k else []
-        capsys.readouterr()
-        assert undulog.run([*words, *more, "-o", str(tmp_path / f"next{k}")]) == 0
-        found.append(json.loads(capsys.readouterr().out))
-        command = commanded(found[-1]["files"][0])
+        more = ("--after", tmp_path / f"driven{k - 1}.mcap") if k else ()
+        found.append(report_of(*words, *more, "-o", tmp_path / f"next{k}"))
+        asked = commanded(found[-1]["files"][0])
         linear_chain.write_run(
-            tmp_path / f"driven{k}.mcap", command, linear_chain.CHAIN @ command, 90 + k, 0.002
+            tmp_path / f"driven{k}.mcap", asked, linear_chain.CHAIN @ asked, 90 + k, 0.002
         )
     first, second = found
     assert (first["plan"], first["settle_s"]) == ("compensate", 10.0)
     assert first["now"] == first["kicked"] == second["kicked"]
     for name in ("gain_cv", "lag_sd"):
         assert second["now"][name]["ci95"][1] < 0.5 * first["now"][name]["ci95"][0]
-    assert undulog.run([*words[:-1], "-o", str(tmp_path / "text")]) == 0
-    text = capsys.readouterr().out
+    text = command(*words, "-o", tmp_path / "text").out
     assert "Gain CV" in text
     assert "The kicks identify" in text
-    assert undulog.run([*words[:-1], "-o", str(tmp_path / "text")]) != 0  # it is there
+    command(*words, "-o", tmp_path / "text", code=2)  # it is there
 
 
 def commanded(file):

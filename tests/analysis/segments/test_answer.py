@@ -62,9 +62,8 @@ def test_a_joint_that_does_not_follow_comes_first(snake):
     first, _, rest = found.sentence.partition(". ")
     assert first == (
         "joint07 does not follow its command from 7.4 s on: jammed or a frozen sensor; joint11 "
-        "responds differently from the others, gain 20 % [18, 22] less"
-    ) or first.startswith("joint07 does not follow its command from 7.4 s on: jammed or a frozen")
-    assert first.index("joint07") < first.index("joint11")
+        "responds differently from the others, gain 20.0 % [18.0, 22.0] less"
+    )
     assert "move alike" in rest
     assert (found.verdict, found.alike) == (Verdict.UNLIKE, False)
 

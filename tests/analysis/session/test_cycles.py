@@ -3,40 +3,31 @@
 import numpy as np
 import pytest
 
+from support.joint_runs import write_joints
 from undulog.analysis.estimators.demodulation import amplitudes, starts_of
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
-from undulog.capture import Session, SessionWriter
+from undulog.capture import Session
 
-EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("a", "b", "c")
 RATE_HZ = 100
 CYCLES = 12
 AMPLITUDE = 0.4
 LAG = np.array([0.1, 0.2, -0.05])
-
-
-def gains(cycle):
-    """Joint b gets weaker by 1 % a cycle."""
-    return np.array([0.9, 1.0 - 0.01 * cycle, 1.1])
+GAINS = np.array([[0.9, 1.0 - 0.01 * cycle, 1.1] for cycle in range(CYCLES)]).T
+"""Joint b gets weaker by 1 % a cycle."""
 
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
     """One cycle a second; the samples of the fifth second are lost."""
     path = tmp_path_factory.mktemp("session") / "run.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
-        for k in range(CYCLES * RATE_HZ):
-            t_ns = EPOCH_NS + k * 10_000_000
-            turn = 2 * np.pi * k / RATE_HZ - np.pi / 3 * np.arange(3)
-            commands.write(t_ns, AMPLITUDE * np.sin(turn))
-            if 5 * RATE_HZ <= k < 6 * RATE_HZ:
-                continue
-            size = AMPLITUDE * gains(k // RATE_HZ)
-            speed = 2 * np.pi * size * np.cos(turn - LAG)
-            states.write(t_ns, size * np.sin(turn - LAG), speed, np.array([0.5, -0.2, 0.1]) * speed)
+    turn = 2 * np.pi * np.arange(CYCLES * RATE_HZ)[:, None] / RATE_HZ - np.pi / 3 * np.arange(3)
+    size = AMPLITUDE * np.repeat(GAINS.T, RATE_HZ, axis=0)
+    size[5 * RATE_HZ : 6 * RATE_HZ] = np.nan
+    speed = 2 * np.pi * size * np.cos(turn - LAG)
+    states = (size * np.sin(turn - LAG), speed, np.array([0.5, -0.2, 0.1]) * speed)
+    write_joints(path, NAMES, AMPLITUDE * np.sin(turn), states, rate_hz=RATE_HZ, gaps=True)
     with Session.open(path) as session:
         return cycle_maps(measure_session(session))
 
@@ -45,17 +36,16 @@ def test_each_cycle_has_its_own_gain_and_lag(maps):
     assert (maps.driven, maps.start_s.size) == (NAMES, CYCLES)
     assert maps.period_s == pytest.approx(1.0, abs=1e-5)
     known = np.arange(CYCLES) != 5
-    truth = np.array([gains(cycle) for cycle in range(CYCLES)]).T
     # The period comes from the responses, too, whose steps move it by 1e-6; the limits of the
     # cycles move with it.
-    np.testing.assert_allclose(maps.gain[:, known], truth[:, known], atol=1e-4)
+    np.testing.assert_allclose(maps.gain[:, known], GAINS[:, known], atol=1e-4)
     expected = np.tile(LAG[:, None], CYCLES)[:, known]
     np.testing.assert_allclose(maps.lag_rad[:, known], expected, atol=1e-3)
 
 
 def test_power_is_torque_times_velocity_with_its_sign(maps):
     # Mean of drag v^2 is drag (2 pi f A)^2 / 2.
-    peak = 2 * np.pi * AMPLITUDE * np.array([gains(cycle) for cycle in range(CYCLES)]).T
+    peak = 2 * np.pi * AMPLITUDE * GAINS
     truth = np.array([[0.5], [-0.2], [0.1]]) * peak**2 / 2
     known = np.arange(CYCLES) != 5
     assert maps.powered == NAMES

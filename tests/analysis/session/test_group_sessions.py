@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from support.analysed import analysed, experiment
+from support.joint_runs import EPOCH_NS, write_joints
 from undulog.analysis.present.result_files import load
-from undulog.capture import SessionWriter
 
-EPOCH_NS = 1_735_689_600_000_000_000
 RATE = 50
 
 
@@ -21,17 +20,11 @@ def write(path, omegas, group, waves, modules, *, seconds=15.0, seed=0, sigma=0.
     place = np.arange(count)
     body = 0.1 * np.exp(-np.abs(place[:, None] - place) + 0.5j) * (1 - np.eye(count))
     epoch_ns = EPOCH_NS + seed * 60_000_000_000
-    with SessionWriter(path, session_id=path.stem, epoch_ns=epoch_ns) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(round(seconds * RATE)):
-            turned = [waves * np.exp(1j * omega * k / RATE) for omega in omegas]
-            command = sum(np.where(group == g, one, 0) for g, one in enumerate(turned))
-            answer = modules * ((0.95 * np.exp(-0.2j)) * command + body @ command)
-            t_ns = epoch_ns + k * 20_000_000
-            commands.write(t_ns, np.real(command))
-            states.write(t_ns, np.real(answer) + sigma * rng.normal(size=count))
-    return path
+    t_s = np.arange(round(seconds * RATE))[:, None] / RATE
+    command = waves * np.exp(1j * np.take(omegas, group) * t_s)
+    answer = np.real(modules * (0.95 * np.exp(-0.2j) * command + command @ body))
+    answer += sigma * rng.normal(size=answer.shape)
+    return write_joints(path, names, np.real(command), [answer], rate_hz=RATE, epoch_ns=epoch_ns)
 
 
 @pytest.fixture(scope="module")

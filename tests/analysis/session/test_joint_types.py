@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from support.ros_bags import EPOCH_NS, GAIN, LAG, NAMES, Filler, ticks, typestore, write_bag
+from support.ros_bags import (
+    EPOCH_NS,
+    GAIN,
+    LAG,
+    NAMES,
+    Filler,
+    filling,
+    ticks,
+    typestore,
+    write_bag,
+)
 
-
-def fill_controller(bag):
-    fill = Filler(bag)
-    for tick in ticks():
-        fill.controller(*tick)
-
-
-def fill_old_controller(bag):
-    fill = Filler(bag)
-    for tick in ticks():
-        fill.controller(*tick, "/arm/state", ("desired", "actual"))
+fill_controller = filling(Filler.controller)
 
 
 def fill_trajectory(bag, **how):
@@ -32,18 +32,14 @@ def fill_horizons(bag):
     fill_trajectory(bag, count=20, stamped=False)
 
 
-def fill_dynamic(bag):
-    fill = Filler(bag)
-    for tick in ticks():
-        fill.dynamic(*tick)
-        fill.trajectory(*tick)
+def dynamic(own, *tick):
+    own.dynamic(*tick)
+    own.trajectory(*tick)
 
 
-def fill_array(bag):
-    fill = Filler(bag)
-    for tick in ticks():
-        fill.state(*tick)
-        fill.array(*tick)
+def array(own, *tick):
+    own.state(*tick)
+    own.array(*tick)
 
 
 def check(result):
@@ -57,7 +53,7 @@ KINDS = {
     "controller": (fill_controller, "/arm/controller_state.reference", "feedback"),
     "trajectory": (fill_trajectory, "commands on /arm/joint_trajectory", ""),
     "horizons": (fill_horizons, "commands on /arm/joint_trajectory", ""),
-    "dynamic": (fill_dynamic, "commands on /arm/joint_trajectory", "/dynamic_joint_states"),
+    "dynamic": (filling(dynamic), "commands on /arm/joint_trajectory", "/dynamic_joint_states"),
 }
 
 
@@ -77,13 +73,14 @@ def test_the_response_comes_out_of_each_type(kind, storage, tmp_path, report_of)
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_every_release_of_the_controller_state(version, storage, tmp_path, report_of):
     old = version in ("foxy", "galactic", "humble")
-    fill = fill_old_controller if old else fill_controller
+    how = ("/arm/state", ("desired", "actual")) if old else ()
+    fill = filling(lambda own, *tick: own.controller(*tick, *how))
     path = write_bag(tmp_path / "bag", fill, storage=storage, store=typestore(version))
     check(report_of("analyse", path))
 
 
 def test_the_joints_of_an_array_are_named_by_the_option(tmp_path, report_of, command):
-    bag = write_bag(tmp_path / "bag", fill_array)
+    bag = write_bag(tmp_path / "bag", filling(array))
     result = report_of("analyse", bag)
     (warning,) = [text for text in result["warnings"] if "no command logged" in text]
     assert "/forward/commands:JOINT,..." in warning
@@ -99,14 +96,12 @@ def test_the_joints_of_an_array_are_named_by_the_option(tmp_path, report_of, com
 
 
 def test_a_controller_is_named_as_a_whole_or_by_its_part(tmp_path, report_of, command):
-    def fill(bag):
-        own = Filler(bag)
-        for tick in ticks():
-            own.controller(*tick)
-            own.controller(*tick, "/leg/controller_state")
-            own.state(*tick, "/other/encoders")
+    def write(own, *tick):
+        own.controller(*tick)
+        own.controller(*tick, "/leg/controller_state")
+        own.state(*tick, "/other/encoders")
 
-    bag = write_bag(tmp_path / "bag", fill)
+    bag = write_bag(tmp_path / "bag", filling(write))
     result = report_of("analyse", bag)
     check(result)
     (found,) = [note for note in result["notes"] if "found by type" in note]
@@ -124,7 +119,7 @@ def test_a_controller_is_named_as_a_whole_or_by_its_part(tmp_path, report_of, co
 def test_further_interfaces_are_read_or_named(tmp_path):
     from undulog.capture import Session
 
-    with Session.open(write_bag(tmp_path / "bag", fill_dynamic)) as session:
+    with Session.open(write_bag(tmp_path / "bag", filling(dynamic))) as session:
         topics = session.joint_topics()
         assert topics.quantities == {"/joint_current": "/dynamic_joint_states.current"}
         assert any("stiffness" in note and "lamp" in note for note in topics.notes)

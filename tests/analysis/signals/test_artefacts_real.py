@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.paths import ARCSNAKE
+from support.written_topics import write_topics
 from undulog.analysis import Options, analyse_session
 from undulog.capture import Session, SessionWriter
 
@@ -25,18 +26,13 @@ def session_of(name, path):
     if not ARCSNAKE.exists():
         pytest.skip(f"the ArcSnake data are not at {ARCSNAKE}")
     raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)
-    channels = {
+    angles = {
         "/wrapped": raw["s_pos"],
         "/motor": np.unwrap(raw["s_pos"], period=4 * math.pi) / GEAR,
         "/reader": raw["m_pos"] / GEAR,
     }
-    with SessionWriter(path, session_id=name, epoch_ns=EPOCH_NS) as writer:
-        opened = {t: writer.joint_state(t, ["joint7"], unit="rad", velocity=True) for t in channels}
-        for k, t in enumerate(raw["time"]):
-            t_ns = EPOCH_NS + round(t * 1e9)
-            for topic, values in channels.items():
-                opened[topic].write(t_ns, values[k : k + 1], raw["speed"][k : k + 1])
-    return path
+    topics = {topic: (["joint7"], "rad", angle, raw["speed"]) for topic, angle in angles.items()}
+    return write_topics(path, EPOCH_NS + np.rint(raw["time"] * 1e9).astype(np.int64), topics)
 
 
 @pytest.mark.slow

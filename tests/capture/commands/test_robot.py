@@ -6,24 +6,18 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from support.joint_runs import write_joints
 from support.paths import ROOT
-from undulog.capture import Session, SessionWriter, load_robot, robot_names
+from undulog.capture import Session, load_robot, robot_names
 from undulog.capture.common.errors import JointSetError
 
-T0 = 1_735_689_600_000_000_000
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
 
 
 def write(path, names=("hip", "knee"), **options):
     """A log of a swing of +-0.3 rad about 0.1 rad at 1 Hz: at most 0.3 * 2 pi rad/s."""
-    with SessionWriter(path, session_id="foreign", epoch_ns=T0, **options) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(1000):
-            angle = 0.1 + 0.3 * np.sin(2 * np.pi * k / 100) * np.ones(len(names))
-            commands.write(T0 + k * 10_000_000, angle)
-            states.write(T0 + k * 10_000_000, angle)
-    return path
+    angle = 0.1 + 0.3 * np.sin(np.pi * np.arange(1000)[:, None] / 50) * np.ones(len(names))
+    return write_joints(path, names, angle, [angle], rate_hz=100, **options)
 
 
 def test_list_and_show_name_the_shipped_robots(report_of, command):
@@ -69,7 +63,7 @@ def test_new_without_a_log_is_valid_and_commented(tmp_path, command):
     assert load_robot(path).joint_names == ("joint01", "joint02")
 
 
-def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command, report_of):
+def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command, report_of, opened):
     log, path = write(tmp_path / "log.mcap"), tmp_path / "mine.toml"
     command("robot", "new", "-o", path, "--from", log)
     text = path.read_text()
@@ -78,8 +72,7 @@ def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command,
     with Session.open(log, robot=path) as session:
         assert session.robot == load_robot(path)
         assert session.joints("/joint_states").names == ("knee", "hip")
-    with Session.open(log) as session:
-        assert session.robot is None
+    assert opened(log).robot is None
     found = report_of("analyse", log, "--robot", path)
     assert found["session"]["robot"] == "mine"
     assert [joint["plane"] for joint in found["joints"]] == ["horizontal"] * 2

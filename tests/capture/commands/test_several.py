@@ -1,17 +1,15 @@
 """Several logs in one command: what is found in folders and patterns, and the table."""
 
 import shutil
-from functools import partial
 
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import StoragePlugin
 
 from support.paths import ROOT
-from support.ros_bags import Filler, ticks, write_bag
+from support.ros_bags import BY_MESSAGE, filling, write_bag, write_split
 from undulog.capture.commands.sessions import first_sentence, sessions_of
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
-MESSAGES = (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
 
 
 @pytest.fixture
@@ -50,24 +48,9 @@ def test_a_rosbag2_folder_is_one_session(folder):
     assert sessions_of([folder])[-1] == folder / "sub"
 
 
-def fill_joints(bag, first=0.0, last=3.0):
-    fill = Filler(bag)
-    for tick in ticks(last):
-        if tick[1] >= first:
-            fill.controller(*tick)
-
-
-def write_parts(folder):
-    """A recording of two files: written as two, and put together."""
-    write_bag(folder, partial(fill_joints, last=1.5), storage=StoragePlugin.SQLITE3)
-    rest = folder.with_name("rest")
-    write_bag(rest, partial(fill_joints, first=1.5), storage=StoragePlugin.SQLITE3)
-    (rest / "rest.db3").rename(folder / "b_1.db3")
-    shutil.rmtree(rest)
-    lines = (folder / "metadata.yaml").read_text().splitlines()
-    at = next(k for k, line in enumerate(lines) if line.strip() == "- b.db3")
-    lines.insert(at + 1, lines[at].replace("b.db3", "b_1.db3"))
-    (folder / "metadata.yaml").write_text("\n".join(lines))
+def joints(first=0.0, last=3.0):
+    """A fill with a controller's joints from one time to another [s]."""
+    return filling(lambda own, *tick: tick[1] >= first and own.controller(*tick), last)
 
 
 @pytest.fixture
@@ -78,9 +61,9 @@ def bags(tmp_path):
     for folder in ("day", "one", "alone"):
         (tmp_path / folder).mkdir()
     for path in (a, e):
-        write_bag(path, fill_joints)
-    write_parts(b)
-    write_bag(c, fill_joints, storage=StoragePlugin.MCAP, compression=MESSAGES)
+        write_bag(path, joints())
+    write_split(b, [joints(last=1.5), joints(first=1.5)], storage=StoragePlugin.SQLITE3)
+    write_bag(c, joints(), storage=StoragePlugin.MCAP, compression=BY_MESSAGE)
     shutil.copy(b / "b.db3", d)
     shutil.copytree(c, tmp_path / "alone/f")
     shutil.copy(GOLDEN, tmp_path / "day/g.mcap")

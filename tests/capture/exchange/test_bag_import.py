@@ -12,9 +12,9 @@ from support.ros_bags import (
     CONTROLLER,
     EPOCH_NS,
     NAMES,
-    STATE,
     Filler,
     commanded,
+    filling,
     header,
     message,
     ticks,
@@ -93,13 +93,9 @@ def test_the_same_bag_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_response_of_an_import_is_that_of_the_bag(kind, tmp_path, report_of):
-    def fill(bag):
-        own = Filler(bag)
-        for tick in ticks():
-            own.controller(*tick)
-
     name, storage = KINDS[kind]
-    bag, output = write_bag(tmp_path / name, fill, storage=storage), tmp_path / "x.mcap"
+    bag = write_bag(tmp_path / name, filling(Filler.controller), storage=storage)
+    output = tmp_path / "x.mcap"
     report_of("import", bag, "-o", output)
     first, second = report_of("analyse", bag), report_of("analyse", output)
     for key in ("gain", "lag_rad"):
@@ -112,15 +108,12 @@ def test_a_db3_without_definitions_finds_the_release(version, tmp_path):
     old = version in ("foxy", "galactic")
     parts = ("desired", "actual") if old else ("reference", "feedback")
 
-    def fill(bag):
-        own = Filler(bag)
-        for tick in ticks(0.5):
-            own.controller(*tick, "/arm/state", parts)
-            own.dynamic(*tick)
+    def write(own, *tick):
+        own.controller(*tick, "/arm/state", parts)
+        own.dynamic(*tick)
 
-    folder = write_bag(
-        tmp_path / "bag", fill, storage=StoragePlugin.SQLITE3, store=typestore(version)
-    )
+    kind = {"storage": StoragePlugin.SQLITE3, "store": typestore(version)}
+    folder = write_bag(tmp_path / "bag", filling(write, 0.5), **kind)
     (path,) = folder.glob("*.db3")
     with sqlite3.connect(path) as base:
         base.execute("DELETE FROM message_definitions")
@@ -137,14 +130,10 @@ def test_a_set_of_joints_that_changes_has_gaps(tmp_path):
     """One joint a message, and one more halfway: none is lost, and none is made up."""
 
     def fill(bag):
-        store = bag.store
+        own = Filler(bag)
         for k, (t_ns, t_s) in enumerate(ticks(2.0)):
-            name = NAMES[k % 2] if k < 100 else NAMES[k % 3]
-            value = commanded(t_s)[NAMES.index(name)]
-            sample = message(
-                store, STATE, header=header(store, t_ns), name=[name], position=np.array([value])
-            )
-            bag.write("/joint_states", t_ns, sample)
+            at = k % 2 if k < 100 else k % 3
+            own.state(t_ns, t_s, positions=[commanded(t_s)[at]], names=[NAMES[at]])
 
     bag = write_bag(tmp_path / "bag", fill)
     import_bag(bag, tmp_path / "x.mcap")
@@ -162,15 +151,11 @@ def test_refusals_name_the_option(tmp_path, command, monkeypatch):
         for t_ns, _ in ticks(0.1):
             bag.write("/word", t_ns, message(bag.store, "std_msgs/msg/String", data="x"))
 
-    def arrays(bag):
-        for tick in ticks(0.1):
-            Filler(bag).array(*tick)
-
     output = tmp_path / "x.mcap"
     empty = write_bag(tmp_path / "none", none)
     how = "choose with --command-topic and --response-topic"
     assert how in command("import", empty, "-o", output, code=1).err
-    bag = write_bag(tmp_path / "arrays", arrays)
+    bag = write_bag(tmp_path / "arrays", filling(Filler.array, 0.1))
     err = command("import", bag, "-o", output, code=1).err
     assert "/forward/commands:JOINT" in err
     assert how in err
@@ -203,18 +188,17 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypatch):
-    def fill(bag):
-        own = Filler(bag)
-        for tick in ticks(0.3):
-            own.controller(*tick)
-            own.dynamic(*tick)
-            own.trajectory(*tick, count=3)
+    def write(own, *tick):
+        own.controller(*tick)
+        own.dynamic(*tick)
+        own.trajectory(*tick, count=3)
 
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     name, storage = KINDS[kind]
-    bag, draw = write_bag(tmp_path / name, fill, storage=storage), np.random.default_rng(23)
+    bag = write_bag(tmp_path / name, filling(write, 0.3), storage=storage)
+    draw = np.random.default_rng(23)
     files = [bag] if bag.is_file() else sorted(bag.iterdir())
     whole = {path: path.read_bytes() for path in files}
     output = tmp_path / "x.mcap"

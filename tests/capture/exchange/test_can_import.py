@@ -244,7 +244,7 @@ def test_sensors_on_the_bus(polled):
         assert session.table("/compass")["magnetic_field.z"].isna().all()
 
 
-def test_samples_of_one_stamp_and_other_frames_keep_their_times(import_text):
+def test_samples_of_one_stamp_and_other_frames_keep_their_times(import_text, opened):
     # A USB adapter may stamp several frames alike: two rounds then begin at one time.
     lines = []
     for k in range(3):
@@ -253,8 +253,7 @@ def test_samples_of_one_stamp_and_other_frames_keep_their_times(import_text):
             data = "0100000000000000" if name[0] == "2" else "0100"
             way = "R" if name[0] == "2" else "T"
             lines.append(f"({t + at * 1e-6:.6f}) can0 {name}#{data} {way}\n")
-    with Session.open(import_text("".join(lines)).output) as session:
-        states = session.joints("/joint_states")
+    states = opened(import_text("".join(lines)).output).joints("/joint_states")
     assert (states.t_ns[1] - states.t_ns[0]).tolist() == [500_000] * 3
 
 

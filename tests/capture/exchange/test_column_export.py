@@ -129,7 +129,7 @@ def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path):
     assert table["joint_states.position [rad]"].null_count == 600 + 4
 
 
-def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
+def test_a_csv_of_one_joint_can_be_imported_again(tmp_path, opened):
     if not RECORDING.exists():
         pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
     robot = load_robot("arcsnake-joint")
@@ -146,8 +146,7 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
     columns = column_map_from_options(options, robot)
     found = open_mapped(tmp_path / "x.csv", columns)
     import_tables(found, tmp_path / "back.mcap", robot=robot, column_map=columns)
-    with Session.open(tmp_path / "back.mcap") as session:
-        back = session.joints("/joint_states").signal("joint01")
+    back = opened(tmp_path / "back.mcap").joints("/joint_states").signal("joint01")
     np.testing.assert_array_equal(back.t_ns, states.t_ns)
     np.testing.assert_array_equal(back.values, states.values)
 

@@ -122,17 +122,15 @@ def test_velocity_without_position_has_its_own_topic(tmp_path):
     assert run(tmp_path, "t,v\n0,1\n", "v=joint01.velocity:rad/s").samples == {"/joint_velocity": 1}
 
 
-def test_unix_times_are_kept_to_the_nanosecond(tmp_path):
+def test_unix_times_are_kept_to_the_nanosecond(tmp_path, opened):
     run(tmp_path, "t,a\n1717639553.000000123,1\n1717639553.000000124,1\n", "a=joint01.position:rad")
-    with Session.open(tmp_path / "run.mcap") as session:
-        t_ns = session.joints("/joint_states").t_ns[0].tolist()
+    t_ns = opened(tmp_path / "run.mcap").joints("/joint_states").t_ns[0].tolist()
     assert t_ns == [1717639553_000000123, 1717639553_000000124]
 
 
-def test_unwrapping_passes_over_gaps(tmp_path):
+def test_unwrapping_passes_over_gaps(tmp_path, opened):
     run(tmp_path, "t,a\n0,170\n1,\n2,-170\n3,-150\n", "a=joint01.position:deg,wrap=360,scale=0.5")
-    with Session.open(tmp_path / "run.mcap") as session:
-        values = session.joints("/joint_states").values[0]
+    values = opened(tmp_path / "run.mcap").joints("/joint_states").values[0]
     np.testing.assert_allclose(np.degrees(values[~np.isnan(values)]), [85, 95, 105])
 
 
@@ -225,11 +223,10 @@ def test_a_csv_of_can_frames_is_reported_from_others(tmp_path):
     assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))
 
 
-def test_a_stopped_import_leaves_a_whole_file(tmp_path):
+def test_a_stopped_import_leaves_a_whole_file(tmp_path, opened):
     text = "t,a\n" + "".join(f"{i},1\n" for i in range(10_000))
     stop = StopRequest()
     stop.signal = 2
     report = run(tmp_path, text, "a=joint01.position:rad", time="ms", stop=stop)
     assert (report.complete, report.verdict) == (False, "degraded")
-    with Session.open(tmp_path / "run.mcap") as session:
-        assert session.warnings == []
+    assert opened(tmp_path / "run.mcap").warnings == []

@@ -3,7 +3,6 @@
 import json
 import struct
 import zlib
-from dataclasses import replace
 
 import can
 import numpy as np
@@ -15,12 +14,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from support.paths import TRACE as RECORDING
 from support.written_frames import T0, every_kind, frames_of, imported, write_frames
-from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.process import StopRequest
-from undulog.capture.exchange import export
+from undulog.capture import Session, load_robot
+from undulog.capture.common.errors import UsageError
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import TABLE_FORMATS, export_columns, export_log
+from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.messages import frames as fr
@@ -283,41 +280,7 @@ def test_the_verb_lists_what_is_lost(session_of_every_kind, tmp_path, command):
     assert "--topics is for tables and layouts; a .blf file has CAN frames" in refused
 
 
-EXPORTS = [
-    *((export_log, suffix) for suffix in FRAME_FORMATS),
-    *((export_columns, suffix) for suffix in TABLE_FORMATS),
-]
-
-
-@pytest.mark.parametrize("case", EXPORTS, ids=lambda case: case[1])
-def test_what_fails_leaves_nothing_behind(case, tmp_path, monkeypatch):
-    exporter, suffix = case
-    source, output = tmp_path / "run.mcap", tmp_path / f"x{suffix}"
-    with SessionWriter(source, session_id="s", epoch_ns=T0) as writer:
-        writer.joint_state("/joint_states", ["a"], unit="rad").write(T0, [1.0])
-        writer.frames("/can/can0").write(T0, every_kind())
-    output.write_text("precious")
-    with pytest.raises(UsageError, match="exists already"):
-        exporter(source, output)
-    stop = StopRequest()
-    stop.signal = 15
-    with pytest.raises(LogWriteError, match="stopped on request"):
-        exporter(source, output, force=True, stop=stop)
-    if exporter is export_log:
-        full = replace(FRAME_FORMATS[suffix], kept=full_disk)
-        monkeypatch.setitem(FRAME_FORMATS, suffix, full)
-    monkeypatch.setattr(export, "_sorted_blocks", full_disk)
-    with pytest.raises(LogWriteError, match="can't be written: No space left"):
-        exporter(source, output, force=True)
-    assert output.read_text() == "precious"
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 def test_a_session_is_not_replaced_by_its_export(tmp_path):
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:1]})
     with pytest.raises(UsageError, match="is the session itself"):
         export_log(source, source, force=True)
-
-
-def full_disk(*_):
-    raise OSError(28, "No space left on device")

@@ -9,6 +9,7 @@ import pytest
 
 from support.paths import SHARED
 from support.written_sessions import write_commands
+from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.exchange.lerobot_export import export_lerobot
@@ -146,14 +147,13 @@ def test_a_real_dataset_comes_back(tmp_path):
             np.testing.assert_array_equal(np.stack(own[name]), np.stack(original[name]))
 
 
-def test_one_joint_is_a_plain_number(tmp_path):
+def test_one_joint_is_a_plain_number(tmp_path, opened):
     write_arm(tmp_path / "run.mcap", names=("only",))
     export_lerobot([tmp_path / "run.mcap"], tmp_path / "set", fps=20)
     frames = frames_of(tmp_path / "set")
     assert frames["action"].dtype == np.float32
     (report,) = import_lerobot(tmp_path / "set", tmp_path / "back")
-    with Session.open(report.output) as session:
-        got = session.joints("/joint_states").signal("only").values
+    got = opened(report.output).joints("/joint_states").signal("only").values
     np.testing.assert_array_equal(got, frames["observation.state"])
 
 
@@ -175,15 +175,12 @@ def test_what_is_no_dataset_is_refused(tmp_path, command):
         export_lerobot(runs, tmp_path / "set", fps=30)
     with pytest.raises(UsageError, match="frames a second, 1 to"):
         export_lerobot(runs[:1], tmp_path / "set", fps=0)
-    with SessionWriter(tmp_path / "c.mcap", session_id="s", epoch_ns=T0) as writer:
-        states = writer.joint_state("/joint_states", ["a", "b"], unit="rad")
-        states.write(T0, [1.0, np.nan])
+    topics = {"/joint_states": (["a", "b"], "rad", [[1.0, np.nan]])}
+    write_topics(tmp_path / "c.mcap", [T0], topics, epoch_ns=T0)
     with pytest.raises(DataError, match="no samples of b"):
         export_lerobot([tmp_path / "c.mcap"], tmp_path / "set", fps=30)
-    with SessionWriter(tmp_path / "d.mcap", session_id="s", epoch_ns=T0) as writer:
-        states = writer.joint_state("/joint_states", ["a"], unit="rad")
-        states.write(T0, [1.0])
-        states.write(T0 + 10**18 // 4, [1.0])  # a clock that jumped by eight years
+    times = [T0, T0 + 10**18 // 4]  # a clock that jumped by eight years
+    write_topics(tmp_path / "d.mcap", times, {"/joint_states": (["a"], "rad", [1.0, 1.0])})
     with pytest.raises(DataError, match=r"would have 7500000001 frames .* cut it first"):
         export_lerobot([tmp_path / "d.mcap"], tmp_path / "set", fps=30)
     assert not list(tmp_path.glob("set*"))

@@ -86,13 +86,12 @@ def test_each_episode_is_a_session(version, tmp_path):
     assert len(ids) == 3
 
 
-def test_one_episode_into_one_file(tmp_path, command):
+def test_one_episode_into_one_file(tmp_path, command, opened):
     folder = dataset(tmp_path / "set", "v3.0")
     line = ["import", folder, "-o", tmp_path / "x.mcap"]
     assert "give a folder as -o, or --episode N" in command(*line, code=2).err
     command(*line, "--episode", 1, "--unit", "position=deg")
-    with Session.open(tmp_path / "x.mcap") as session:
-        states = session.joints("/joint_states").signal("shoulder_pan").values
+    states = opened(tmp_path / "x.mcap").joints("/joint_states").signal("shoulder_pan").values
     np.testing.assert_allclose(states, np.radians(values(1)[:, 0].astype(float)))
     assert "times made from fps = 30" in command("log", "check", tmp_path / "x.mcap").out
     with pytest.raises(ImportFormatError, match="has no episode 7; it has 0, 1, 2"):

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from support.written_sessions import joint_state, write_foreign
-from undulog.capture import SessionWriter
+from support.written_topics import write_topics
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.exchange.plot_layouts import (
     Curve,
@@ -30,14 +30,10 @@ FOXGLOVE = re.compile(r'"?(?P<topic>[^".]+)"?\.position\[(?P<place>\d+)\]')
 @pytest.fixture
 def run(tmp_path):
     """Commands and states whose messages have the joints in different orders."""
-    rng = np.random.default_rng(4)
-    with SessionWriter(tmp_path / "run.mcap", session_id="s", epoch_ns=T0) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES[::-1], unit="rad")
-        for k in range(20):
-            commands.write(T0 + k * 10**8, rng.normal(size=8))
-            states.write(T0 + k * 10**8, rng.normal(size=8))
-    return tmp_path / "run.mcap"
+    commands, states = np.random.default_rng(4).normal(size=(2, 20, 8))
+    topics = {"/joint_commands": (NAMES, "rad", commands)}
+    topics["/joint_states"] = (NAMES[::-1], "rad", states)
+    return write_topics(tmp_path / "run.mcap", T0 + np.arange(20) * 10**8, topics, epoch_ns=T0)
 
 
 def panels_of(layout):

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from support.paths import SHARED
 from support.written_sessions import joint_state, write_foreign, write_session
+from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.exchange.table_import import import_tables, open_tables
@@ -190,13 +191,11 @@ def test_what_is_no_wide_table_is_refused(tmp_path, command):
     )
     command(*line, tmp_path / "x.csv")
     assert "exists already" in command(*line, tmp_path / "x.csv", code=2).err
-    names = [f"j{k}" for k in range(2001)]
-    with SessionWriter(tmp_path / "wide.mcap", session_id="s", epoch_ns=T0) as writer:
-        writer.joint_state("/joint_states", names, unit="rad").write(T0, np.zeros(len(names)))
+    topics = {"/joint_states": ([f"j{k}" for k in range(2001)], "rad", np.zeros((1, 2001)))}
+    write_topics(tmp_path / "wide.mcap", [T0], topics, epoch_ns=T0)
     with pytest.raises(UsageError, match="has 2001 joint columns; a wide table takes at most 2000"):
         export_wide(tmp_path / "wide.mcap", tmp_path / "y.csv")
-    with SessionWriter(tmp_path / "none.mcap", session_id="s", epoch_ns=T0) as writer:
-        writer.joint_state("/joint_states", ["a"], unit="rad")
+    write_topics(tmp_path / "none.mcap", [], {"/joint_states": (["a"], "rad", [])}, epoch_ns=T0)
     with pytest.raises(DataError, match="carry no values"):
         export_wide(tmp_path / "none.mcap", tmp_path / "y.csv")
     assert not (tmp_path / "y.csv").exists()
@@ -204,13 +203,10 @@ def test_what_is_no_wide_table_is_refused(tmp_path, command):
 
 
 def test_a_large_table_that_is_nearly_empty_is_refused(tmp_path, monkeypatch):
-    names = [f"j{k}" for k in range(250)]
-    with SessionWriter(tmp_path / "run.mcap", session_id="s", epoch_ns=T0) as writer:
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
-        offsets.write(T0, 1e-6 * np.arange(250))
-        for k in range(4):
-            states.write(T0 + k * 10_000_000, np.zeros(250))
+    names, offsets = [f"j{k}" for k in range(250)], np.tile(1e-6 * np.arange(250), (4, 1))
+    topics = {"/joint_states": (names, "rad", np.zeros((4, 250)))}
+    topics["/joint_sample_offset"] = (names, "s", offsets)
+    write_topics(tmp_path / "run.mcap", T0 + np.arange(4) * 10_000_000, topics, epoch_ns=T0)
     assert export_wide(tmp_path / "run.mcap", tmp_path / "x.csv").facts["rows"] == 1000
     monkeypatch.setattr("undulog.capture.exchange.wide_table._MOST_SPARSE", 10_000)
     with pytest.raises(UsageError, match=r"empty but for 0\.4% of its cells; choose columns"):

@@ -12,7 +12,8 @@ from rosbags.highlevel import AnyReader
 from support.edited_logs import EPOCH_NS, MAKES, MS, between, read, records, text, ticks, write_log
 from support.foreign_logs import foreign_log
 from support.read_back import summary_of
-from undulog.capture import Session, SessionWriter, load_robot
+from support.written_topics import write_topics
+from undulog.capture import Session, load_robot
 from undulog.capture.log.cut import cut_log
 from undulog.capture.log.messages.definitions import schema_text
 
@@ -74,13 +75,10 @@ def test_a_cut_keeps_what_explains_the_log_and_says_what_it_is(tmp_path):
 
 def test_a_session_that_was_cut_reads_as_one(tmp_path):
     robot = load_robot("snake13")
-    facts = {"session_id": "s1", "epoch_ns": EPOCH_NS, "robot": robot}
-    with SessionWriter(tmp_path / "run.mcap", **facts) as writer:
-        states = writer.joint_state("/joint_states", robot.joint_names, unit="rad", velocity=True)
-        for k in range(300):
-            values = np.full(len(robot.joint_names), 0.001 * k)
-            states.write(EPOCH_NS + k * 10 * MS, values, values + 1)
-        writer.set_verdict("good")
+    facts = {"session_id": "s1", "epoch_ns": EPOCH_NS, "robot": robot, "verdict": "good"}
+    values = 0.001 * np.arange(300)[:, None] * np.ones(len(robot.joint_names))
+    topics = {"/joint_states": (robot.joint_names, "rad", values, values + 1)}
+    write_topics(tmp_path / "run.mcap", EPOCH_NS + np.arange(300) * 10 * MS, topics, **facts)
     cut_log(tmp_path / "run.mcap", tmp_path / "cut.mcap", start_s=1.0, stop_s=2.0)
     with Session.open(tmp_path / "cut.mcap") as session:
         assert session.warnings == []

@@ -133,7 +133,7 @@ def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path, command):
     assert set(tmp_path.iterdir()) == {one, two, silent, path}
 
 
-def test_a_definition_with_other_comments_is_the_same_type(tmp_path):
+def test_a_definition_with_other_comments_is_the_same_type(tmp_path, opened):
     definitions = ["string data", "# a text\nstring   data  # a word\n", "float64 data"]
     *logs, other = [tmp_path / f"{k}.mcap" for k in range(3)]
     for k, definition in enumerate(definitions):
@@ -141,8 +141,7 @@ def test_a_definition_with_other_comments_is_the_same_type(tmp_path):
             channel = writer.register_channel("/a", "cdr", schema)
             writer.add_message(channel, EPOCH_NS + k, text(f"{k}"), 0)
     merge_logs(logs, tmp_path / "both.mcap")
-    with Session.open(tmp_path / "both.mcap") as session:
-        assert [m.data for _, m in session.messages("/a")] == ["0", "1"]
+    assert [m.data for _, m in opened(tmp_path / "both.mcap").messages("/a")] == ["0", "1"]
     merge_logs(logs[::-1], tmp_path / "other.mcap")
     with pytest.raises(DataError, match="the same name with another definition"):
         merge_logs([logs[0], other], tmp_path / "never.mcap")

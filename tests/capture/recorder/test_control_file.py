@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from support.control_clients import connected, drain, echo, polled, polls, started_recorder
-from support.processes import wait_for
+from support.processes import repeating, wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder import control_client
 from undulog.capture.recorder.control import TEND_POLLS, ControlServer
@@ -21,26 +21,22 @@ from undulog.capture.recorder.control import TEND_POLLS, ControlServer
 
 def test_only_its_user_can_reach_it_from_the_first_moment(tmp_path):
     path = tmp_path / "c.sock"
-    seen, ended = set(), threading.Event()
+    seen = set()
 
-    def watch():
-        while not ended.is_set():
-            with contextlib.suppress(FileNotFoundError):
-                seen.add(stat.S_IMODE(os.lstat(path).st_mode))
+    def look():
+        with contextlib.suppress(FileNotFoundError):
+            seen.add(stat.S_IMODE(os.lstat(path).st_mode))
 
     before = os.umask(0)
-    thread = threading.Thread(target=watch)
-    thread.start()
     try:
-        for _ in range(300):
-            ControlServer(path, echo).close()
-            assert not path.exists()
-        held = ControlServer(path, echo)
-        wait_for(lambda: seen)
-        held.close()
+        with repeating(look, 0):
+            for _ in range(300):
+                ControlServer(path, echo).close()
+                assert not path.exists()
+            held = ControlServer(path, echo)
+            wait_for(lambda: seen)
+            held.close()
     finally:
-        ended.set()
-        thread.join()
         assert os.umask(before) == 0, "the umask is back as it was"
     assert seen == {0o600}
 

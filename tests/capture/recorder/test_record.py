@@ -19,6 +19,7 @@ from support.written_frames import frames_of
 from undulog.capture import Session
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.health import LiveHealth
 from undulog.capture.recorder.recording import Recording
 from undulog.capture.recorder.settings import resolve
@@ -27,13 +28,9 @@ FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 
 
 def ask(output, **request):
-    """One request over the control socket, by hand."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-        client.settimeout(30)
-        client.connect(str(output.with_name("control.sock")))
-        client.sendall(json.dumps(request).encode() + b"\n")
-        with client.makefile() as replies:
-            return json.loads(replies.readline())
+    """One request over the control socket."""
+    with ControlClient(output.with_name("control.sock")) as client:
+        return client.ask(request)
 
 
 @pytest.fixture
@@ -54,7 +51,7 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
         send(bus, frames)
         wait_for(lambda: ask(output, do="status")["sources"][0]["frames"] == len(frames))
-        assert ask(output, do="stop", wait=True)["ok"]
+        ask(output, do="stop", wait=True)
         report, _ = ended(process)
     assert process.returncode == 0
     assert report["sources"]["can0"]["frames"] == len(frames)
@@ -157,8 +154,7 @@ def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, fault, t
     output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
     if existing is not None:
         (tmp_path / existing).write_text("precious")
-    done = run(*command(output, f"unix:{bus}"), "--floor", floor, cwd=ROOT)
-    assert done.returncode == code
+    done = run(*command(output, f"unix:{bus}"), "--floor", floor, cwd=ROOT, code=code)
     assert fault in done.stderr
     left = {path.name: path.read_text() for path in tmp_path.iterdir()}
     assert left == ({} if existing is None else {existing: "precious"})
@@ -176,15 +172,13 @@ def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, fault, t
     ],
 )
 def test_wrong_usage_is_reported_before_anything_is_made(arguments, fault, tmp_path):
-    done = run(*command(tmp_path / "run.mcap", *arguments), cwd=ROOT)
-    assert done.returncode == 2, done.stderr
-    assert fault in done.stderr
+    assert fault in run(*command(tmp_path / "run.mcap", *arguments), cwd=ROOT, code=2).stderr
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("floor", ["10MB", "0"], ids=["floor", "to the last byte"])
-def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path):
+def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path, opened):
     output, bus = disk_of("64m") / "run.mcap", tmp_path / "bus.sock"
     rng = np.random.default_rng(0)
     frames, _ = polling(400)
@@ -207,8 +201,7 @@ def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path):
     assert "MB" in err or "space" in err
     assert report["failed"]
     kept = frames_of(output)
-    with Session.open(output) as session:
-        assert session.verdict is not None
+    assert opened(output).verdict is not None
     assert check_session(output).file.indexed
     sent = np.concatenate(sent)
     for field in ("t_device_ns", "id_flags", "data"):
@@ -262,7 +255,7 @@ def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path, out
 # -- while it runs --------------------------------------------------------------------------------
 
 
-def test_a_split_session_is_one_session(tmp_path, output, bus):
+def test_a_split_session_is_one_session(tmp_path, output, bus, opened):
     frames, _ = polling(300)
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
         send(bus, frames[:7500])
@@ -276,5 +269,4 @@ def test_a_split_session_is_one_session(tmp_path, output, bus):
             np.testing.assert_array_equal(kept["t_device_ns"], frames["t_device_ns"])
             assert session.warnings == []
     shutil.move(output, tmp_path / "elsewhere")
-    with Session.open(tmp_path / "run_0002.mcap") as session:
-        assert any("part" in warning for warning in session.warnings)
+    assert any("part" in warning for warning in opened(tmp_path / "run_0002.mcap").warnings)

@@ -14,7 +14,6 @@ from support import processes
 from support.processes import UNDULOG, python, wait_for
 from support.processes import undulog as undulog_command
 from support.read_back import decoded_of
-from undulog.capture import Session
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
 PATIENCE_S = 60.0
@@ -71,7 +70,7 @@ def test_without_a_recorder_there_is_nobody_to_ask(place, ask):
     assert "none.sock: no recorder listens there" in err
 
 
-def test_a_recording_from_status_to_stop(recorder, place, ask):
+def test_a_recording_from_status_to_stop(recorder, place, ask, opened):
     process = recorder("run", "--operator", "Ada")
     assert ask("status").out.startswith(f"{place}/run.mcap: recording, ")
     (status,) = json.loads(ask("status", "--json").out)["recordings"]
@@ -86,8 +85,7 @@ def test_a_recording_from_status_to_stop(recorder, place, ask):
     assert ("operator", 20, "mark: slipped on sand") in events(first)
     assert ("operator", 30, "battery changed") in events(first)
     events(second)
-    with Session.open(first) as session:
-        assert session.metadata["undulog"]["operator"] == "Ada"
+    assert opened(first).metadata["undulog"]["operator"] == "Ada"
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert find_sockets(os.environ) == []
@@ -129,8 +127,7 @@ def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorde
     (place / "b").mkdir()
     socket = place / "r" / "undulog" / "run.sock"
     words = (f"unix:{place}/b.frames", "-o", place / "b" / "run.mcap", "--socket", socket)
-    done = undulog_command("record", *words)
-    assert done.returncode == 1
+    done = undulog_command("record", *words, code=1)
     assert "another recorder listens there; end it, or name another with --socket" in done.stderr
     assert list((place / "b").iterdir()) == []
     with ControlClient(socket) as client:

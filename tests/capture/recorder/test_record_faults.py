@@ -100,7 +100,7 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first, tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["decode", "map", "write"])
-def test_a_failure_of_decoding_costs_the_frames_that_cause_it(stage, tmp_path, monkeypatch):
+def test_a_failure_of_decoding_costs_the_frames_that_cause_it(stage, tmp_path, monkeypatch, opened):
     """Every 200th frame makes one stage raise, as a fault of the program would."""
     owner, method, fails = {
         "decode": (BusDecoder, "decode", lambda _, args: (args[0]["t_device_ns"] % 200 == 1).any()),
@@ -134,8 +134,7 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(stage, tmp_path, m
     assert all("decoding failed with ZeroDivisionError" in text for text in faults)
     assert counts(path)["/can/can0"] > 0
     assert len(frames_of(path)) == len(frames)
-    with Session.open(path) as session:
-        samples = sum(np.isfinite(v).sum() for v in session.joints("/joint_states").values)
+    samples = sum(np.isfinite(v).sum() for v in opened(path).joints("/joint_states").values)
     if stage == "map":
         assert samples == CYCLES * JOINTS
     elif stage == "decode":

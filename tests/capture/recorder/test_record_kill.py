@@ -118,5 +118,4 @@ def test_fifty_kills(options, tmp_path, command, cycle):
         folder = tmp_path / str(seed)
         folder.mkdir()
         for file in check_kill(command, folder, *record_and_kill(cycle, folder, seed, *options)):
-            done = run(rerun, "mcap", "check", file)
-            assert done.returncode == 0, (seed, done.stdout, done.stderr)
+            run(rerun, "mcap", "check", file, code=0)

@@ -4,7 +4,7 @@ import can
 import numpy as np
 import pytest
 
-from support.can_messages import can_message
+from support.can_messages import can_message, fd_traffic, same, traffic
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FD_ESI
 from undulog.capture.robot.model import ClockDomain
@@ -35,7 +35,7 @@ def connect(listen):
     return start
 
 
-def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same):
+def test_twenty_thousand_frames_arrive_as_sent(bus, connect):
     truth = traffic(20_000)
     reader = connect()
     for start in range(0, len(truth), 500):
@@ -53,7 +53,7 @@ def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same):
     assert bus.recv(0) is None  # it sent nothing
 
 
-def test_the_devices_times_to_the_microsecond(bus, connect, traffic):
+def test_the_devices_times_to_the_microsecond(bus, connect):
     truth = traffic(2000)
     reader = connect("?device_time=1&preserve_timestamps=1")
     assert reader.source.clock is ClockDomain.DEVICE
@@ -89,7 +89,7 @@ def test_error_frames(bus, connect):
     reader.until_event("back on the bus")
 
 
-def test_can_fd_frames(bus, connect, traffic, fd_traffic, same):
+def test_can_fd_frames(bus, connect):
     truth, fd_truth = traffic(500), fd_traffic(500)
     fd_truth["fd_flags"][::3] |= FD_ESI
     reader = connect()
@@ -102,7 +102,7 @@ def test_can_fd_frames(bus, connect, traffic, fd_traffic, same):
     assert reader.counts.frames == 1000
 
 
-def test_a_driver_that_does_not_mark_can_fd(same):
+def test_a_driver_that_does_not_mark_can_fd():
     """Eight bytes fit a classic frame, more don't, whatever the driver calls it."""
     messages = [(7, can.Message(data=range(12)))]
     link_frames = can_source.frames_of(messages, device_time=False, fd=True)

@@ -5,7 +5,6 @@ import fcntl
 import os
 import random
 import select
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from scservo_sdk import PortHandler
 
+from support.processes import process, python
 from support.serial_lines import Line
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import SERIAL_MORE, SERIAL_NOISE
@@ -94,21 +94,18 @@ def _only_readers(path):
                 yield int(one.name)
 
 
-HOLD = "import os, sys, time; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(1, flush=True)"
+HOLD = """import os, sys, time
+os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
+print(1, flush=True)
+time.sleep(60)
+"""
 
 
 def test_a_port_that_is_held_is_refused_with_its_holder(tmp_path, listen, line):
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLD + "; time.sleep(60)", tmp_path / "ttyUSB0"],
-        stdout=subprocess.PIPE,
-    )
-    try:
+    with process(sys.executable, "-c", HOLD, tmp_path / "ttyUSB0") as holder:
         holder.stdout.readline()
         with pytest.raises(SourceError, match=rf"is held by python\S* \({holder.pid}\)"):
             listen(source_at(tmp_path))
-    finally:
-        holder.kill()
-        holder.communicate()
 
 
 def test_it_is_opened_for_one_alone(tmp_path, listen, line):
@@ -119,13 +116,7 @@ def test_it_is_opened_for_one_alone(tmp_path, listen, line):
         "try: open_exclusively(sys.argv[1], 1000000)\n"
         "except Exception as error: print(error)"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "ttyUSB0"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert f"({os.getpid()})" in said.stdout
+    assert f"({os.getpid()})" in python(code, tmp_path / "ttyUSB0", code=0).stdout
 
 
 def test_an_unplugged_port_is_lost_and_comes_back(tmp_path, listen):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from can.util import len2dlc
 
-from support.can_messages import can_message, cut_at_random, received
+from support.can_messages import can_message, cut_at_random, fd_traffic, received, same, traffic
 from support.processes import wait_for
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG
@@ -131,7 +131,7 @@ def commands(adapter):
     return [command for command in adapter.commands if command != b"C"]
 
 
-def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same):
+def test_twenty_thousand_frames_arrive_as_sent(connect):
     adapter, reader = connect()
     truth = traffic(20_000)
     assert reader.source.connected
@@ -145,7 +145,7 @@ def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same):
     assert (counts.frames, counts.malformed, counts.dropped) == (20_000, 0, None)
 
 
-def test_it_listens_only_and_never_transmits(connect, traffic):
+def test_it_listens_only_and_never_transmits(connect):
     adapter, reader = connect()
     assert "listen-only, 1000000 bit/s" in reader.texts[-1]
     adapter.send(stream(traffic(100)))
@@ -157,7 +157,7 @@ def test_it_listens_only_and_never_transmits(connect, traffic):
     assert not reader.source.connected
 
 
-def test_the_adapters_clock_runs_on_over_the_minute(connect, traffic, same):
+def test_the_adapters_clock_runs_on_over_the_minute(connect):
     adapter, reader = connect("bitrate=500000&timestamps=1")
     truth = traffic(20_000)
     stamps_ms = 51_234 + 7 * np.arange(len(truth))
@@ -180,14 +180,14 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock():
 
 
 @pytest.mark.parametrize(("asked", "given"), [(True, None), (False, np.arange(50))])
-def test_stamps_that_are_missing_or_unwanted_are_no_times_and_no_data(asked, given, traffic, same):
+def test_stamps_that_are_missing_or_unwanted_are_no_times_and_no_data(asked, given):
     truth = traffic(50)
     frames, _ = SlcanText(stamps=asked).feed(stream(truth, given), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
 
-def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same):
+def test_a_recorder_that_is_held_up_loses_nothing(connect):
     adapter, reader = connect()
     truth = traffic(20_000)  # half a megabyte: several times what the terminal holds
     adapter.send(stream(truth))
@@ -197,7 +197,7 @@ def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same):
     assert len(np.unique(found["t_host_ns"])) > 5  # each stamped when it was read
 
 
-def test_noise_costs_its_own_line_only(connect, traffic, same):
+def test_noise_costs_its_own_line_only(connect):
     adapter, reader = connect()
     truth = traffic(1000)
     noise = [
@@ -224,7 +224,7 @@ def test_noise_costs_its_own_line_only(connect, traffic, same):
     reader.until_event("malformed line")
 
 
-def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
+def test_any_way_of_cutting_the_stream_gives_the_same():
     whole_stream = stream(traffic(300)) + b"\xff\r" + stream(traffic(300))
     whole, _ = SlcanText(stamps=False).feed(whole_stream, 5, Tally(lambda: 0))
     for seed in range(20):
@@ -234,7 +234,7 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
         assert tally.counts.malformed == 1
 
 
-def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same):
+def test_can_fd_frames_among_the_others(connect):
     adapter, reader = connect()
     truth, fd_truth = traffic(2000), fd_traffic(2000)
     mixed = itertools.chain.from_iterable(zip(lines(truth), lines(fd_truth), strict=True))
@@ -245,7 +245,7 @@ def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same):
     assert reader.counts.frames == 4000
 
 
-def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same):
+def test_an_adapter_stamps_can_fd_frames_too():
     truth = fd_traffic(100)
     tally = Tally(lambda: 0)
     stamped = stream(truth, 10 * np.arange(100))
@@ -256,7 +256,7 @@ def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same):
     assert set(frames["t_host_ns"].tolist()) == {10**18}
 
 
-def test_unplugged_and_plugged_in_again(connect, plug, traffic, same):
+def test_unplugged_and_plugged_in_again(connect, plug):
     first, second = traffic(500), traffic(700)
     adapter, reader = connect()
     adapter.send(stream(first))
@@ -275,7 +275,7 @@ def test_unplugged_and_plugged_in_again(connect, plug, traffic, same):
     assert not reader.source.finished
 
 
-def test_an_adapter_that_is_not_there_yet_is_waited_for(plug, tmp_path, listen, traffic, same):
+def test_an_adapter_that_is_not_there_yet_is_waited_for(plug, tmp_path, listen):
     reader = listen(source_at(tmp_path))
     assert "No such file" in reader.until_event("waits for").text
     assert not reader.source.connected
@@ -291,7 +291,7 @@ def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, 
     assert b"O" not in adapter.commands
 
 
-def test_listen_only_can_be_given_up(connect, traffic, same):
+def test_listen_only_can_be_given_up(connect):
     adapter, reader = connect("listen_only=0", refuses=b"L")
     truth = traffic(100)
     assert "acknowledges" in reader.texts[-1]
@@ -300,7 +300,7 @@ def test_listen_only_can_be_given_up(connect, traffic, same):
     assert commands(adapter) == [b"O"]
 
 
-def test_an_adapter_that_never_answers(connect, traffic, same):
+def test_an_adapter_that_never_answers(connect):
     adapter, reader = connect(answers=False)
     truth = traffic(100)
     adapter.send(stream(truth))
@@ -322,7 +322,7 @@ def test_what_can_never_work_is_refused_at_once(tmp_path, context):
             source_at(tmp_path, query)
 
 
-def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, same):
+def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen):
     pytest.importorskip("serial")
     from can.interfaces.slcan import slcanBus
 
@@ -333,6 +333,7 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
         time.sleep(0.01)
     adapter.send(stream(truth))
     _, frames = received(bus, len(truth))
+    bus.shutdown()
     assert same(frames, truth)
     reader = listen(source_at(tmp_path))
     reader.until_event("connected")
@@ -340,7 +341,7 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
     assert same(reader.until_frames(1000), frames)
 
 
-def test_can_fd_frames_as_python_cans_own_client_writes_them(plug, tmp_path, fd_traffic, same):
+def test_can_fd_frames_as_python_cans_own_client_writes_them(plug, tmp_path):
     pytest.importorskip("serial")
     from can.interfaces.slcan import slcanBus
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
-from support.can_messages import can_message
+from support.can_messages import can_message, fd_traffic, same, traffic
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FD_BRS, FD_ESI
 from undulog.capture.robot.model import ClockDomain
@@ -34,7 +34,7 @@ def pair(sockets):
     return sockets
 
 
-def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same):
+def test_twenty_thousand_frames_as_packed_by_python_can(pair):
     ours, theirs = pair
     truth = traffic(20_000)
     tally = Tally(time.time_ns)
@@ -53,7 +53,7 @@ def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same):
     link.close()
 
 
-def test_drops_are_those_that_the_kernel_counts(pair, traffic):
+def test_drops_are_those_that_the_kernel_counts(pair):
     ours, theirs = pair
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
     frame = packed(traffic(1)[0])
@@ -72,7 +72,7 @@ def test_drops_are_those_that_the_kernel_counts(pair, traffic):
     link.close()
 
 
-def test_arrival_is_the_kernels(pair, traffic):
+def test_arrival_is_the_kernels(pair):
     ours, theirs = pair
     link = SocketcanLink(ours, Tally(time.time_ns))
     before_ns = time.time_ns()
@@ -85,7 +85,7 @@ def test_arrival_is_the_kernels(pair, traffic):
     link.close()
 
 
-def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same):
+def test_can_fd_frames_and_what_is_no_frame(pair):
     ours, theirs = pair
     truth, fd_truth = traffic(2), fd_traffic(40)
     fd_truth["fd_flags"][::3] |= FD_ESI
@@ -110,7 +110,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same):
     link.close()
 
 
-def test_frames_of_this_computer_are_marked(traffic):
+def test_frames_of_this_computer_are_marked():
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
     batch = reader_thread.Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
     assert frames_of(batch, [5, 6])["dir"].tolist() == [DIR_RX, DIR_TX]

@@ -9,7 +9,7 @@ import can
 import numpy as np
 import pytest
 
-from support.can_messages import cut_at_random, received
+from support.can_messages import cut_at_random, received, same, traffic
 from support.processes import start
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
@@ -103,7 +103,7 @@ def source_at(port, channel="can0"):
 
 
 @pytest.mark.parametrize("blank", ["", " "])
-def test_many_frames_and_their_times_to_the_microsecond(serve, listen, traffic, same, blank):
+def test_many_frames_and_their_times_to_the_microsecond(serve, listen, blank):
     truth = traffic(20_000)
     server = serve()
     server.stream = messages(truth, blank)
@@ -117,19 +117,19 @@ def test_many_frames_and_their_times_to_the_microsecond(serve, listen, traffic, 
     assert server.requests == [b"< open can0 >", b"< rawmode >"]
 
 
-def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same):
-    truth = traffic(20_000)
-    truth = truth[(truth["id_flags"] & REMOTE_FLAG) == 0]  # it has no remote requests
+def test_python_cans_own_client_reads_the_same(serve, listen):
+    truth = traffic(20_000, remote_share=0)  # it has no remote requests
     server = serve(pause_s=0.3)  # it can't bear frames right behind the last answer
     server.stream = messages(truth)
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=server.port, channel="can0")
     theirs, frames = received(bus, len(truth))
+    bus.shutdown()
     found = listen(source_at(server.port)).until_frames(len(truth))
     assert same(found, frames)
     assert np.abs(found["t_device_ns"] / 1e9 - np.array([m.timestamp for m in theirs])).max() < 1e-6
 
 
-def test_error_frames_are_frames_and_events(serve, listen, traffic, same):
+def test_error_frames_are_frames_and_events(serve, listen):
     truth = traffic(10)
     server = serve()
     faults = b"< error 040 1700000001.000001 >< error 020 1700000001.000002 >"
@@ -152,7 +152,7 @@ def test_error_frames_are_frames_and_events(serve, listen, traffic, same):
     assert theirs.arbitration_id == int(errors["id_flags"][0]) & ID_MASK
 
 
-def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
+def test_any_way_of_cutting_the_stream_gives_the_same():
     truth = traffic(200)
     stream = messages(truth) + b"< frame 12Z 1.0 00 >" + messages(truth, " ") + b"< ok >"
     whole = SocketcandText().feed(stream, 5, Tally(lambda: 0))
@@ -164,7 +164,7 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
         assert tally.counts.malformed == 1
 
 
-def test_noise_costs_its_own_message_only(traffic, same):
+def test_noise_costs_its_own_message_only():
     truth = traffic(1000)
     noise = [
         b"< frame 123 1.000000 11",  # cut short: the next one begins
@@ -205,7 +205,7 @@ def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted():
     assert tally.counts.malformed == 12
 
 
-def test_can_fd_frames_are_left_out_and_counted(traffic, same):
+def test_can_fd_frames_are_left_out_and_counted():
     truth = traffic(3)
     tally = Tally(lambda: 0)
     stream = messages(truth) + b"< frame 123 1.000000 " + b"AB" * 12 + b" >"
@@ -228,7 +228,7 @@ time.sleep(600)
 """
 
 
-def test_the_server_is_killed_and_comes_back(listen, traffic, same):
+def test_the_server_is_killed_and_comes_back(listen):
     first, second = traffic(100), traffic(200)
     with start(sys.executable, "-c", KILLED, 0, messages(first).decode()) as process:
         port = int(process.stdout.readline())
@@ -247,7 +247,7 @@ def test_the_server_is_killed_and_comes_back(listen, traffic, same):
     reader.until_event("is back after")
 
 
-def test_a_server_that_comes_later(listen, serve, traffic, same):
+def test_a_server_that_comes_later(listen, serve):
     with socket.create_server(("127.0.0.1", 0)) as reserved:
         port = reserved.getsockname()[1]
     reader = listen(source_at(port))

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.can_messages import same, traffic
 from support.processes import python, start, wait_for
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
@@ -88,7 +89,7 @@ def peer(path):
 
 
 @pytest.mark.parametrize(("per_packet", "head"), [(256, 1), (1, 0), (7, 1)])
-def test_twenty_thousand_frames_of_a_foreign_process(path, reader, same, per_packet, head):
+def test_twenty_thousand_frames_of_a_foreign_process(path, reader, per_packet, head):
     truth = foreign_truth(0, 20_000)
     with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
         found = reader.until_frames(20_000)
@@ -103,7 +104,7 @@ def test_twenty_thousand_frames_of_a_foreign_process(path, reader, same, per_pac
     assert reader.source.clock is ClockDomain.DEVICE
 
 
-def test_what_our_sender_offers_arrives(tmp_path, path, reader, traffic, same):
+def test_what_our_sender_offers_arrives(tmp_path, path, reader):
     truth = traffic(20_000)
     np.save(tmp_path / "frames.npy", truth)
     with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
@@ -117,7 +118,7 @@ def test_what_our_sender_offers_arrives(tmp_path, path, reader, traffic, same):
     assert reader.counts.dropped == refused - before  # refused before it was connected
 
 
-def test_frames_that_found_no_room_are_proved_lost(path, reader, traffic, same):
+def test_frames_that_found_no_room_are_proved_lost(path, reader):
     truth = traffic(200)
     sender = FrameSender(path)
     sent = []
@@ -132,7 +133,7 @@ def test_frames_that_found_no_room_are_proved_lost(path, reader, traffic, same):
     sender.close()
 
 
-def test_the_last_losses_are_reported_on_leaving(path, reader, traffic):
+def test_the_last_losses_are_reported_on_leaving(path, reader):
     truth = traffic(200)
     sender = FrameSender(path)
     while sender.refused == 0:
@@ -151,7 +152,7 @@ def test_a_gap_in_the_numbers_is_a_loss(reader, peer):
     assert reader.counts.dropped == 10 + 3
 
 
-def test_malformed_packets_are_counted_and_reported(reader, peer, traffic, same):
+def test_malformed_packets_are_counted_and_reported(reader, peer):
     truth = traffic(3)
     sock = peer()
     sock.send(truth[:1].tobytes())
@@ -194,7 +195,7 @@ def test_two_senders_are_put_in_the_order_of_arrival(reader, peer):
     assert reader.until_frames(40)["id_flags"].tolist() == list(range(40))
 
 
-def test_a_sender_may_leave_and_come_back(path, reader, same):
+def test_a_sender_may_leave_and_come_back(path, reader):
     for first in (0, 100):
         with start(sys.executable, "-c", FOREIGN, path, first, 100, 10, 1) as process:
             reader.until_frames(first + 100)
@@ -207,7 +208,7 @@ def test_a_sender_may_leave_and_come_back(path, reader, same):
     assert not reader.source.finished
 
 
-def test_a_killed_sender_loses_nothing_that_it_sent(path, reader, same):
+def test_a_killed_sender_loses_nothing_that_it_sent(path, reader):
     code = FOREIGN.replace("peer.close()", "import os; os.kill(os.getpid(), 9)")
     assert python(code, path, 0, 200, 1, 1).returncode == -9
     assert same(reader.until_frames(200), foreign_truth(0, 200))
@@ -215,7 +216,7 @@ def test_a_killed_sender_loses_nothing_that_it_sent(path, reader, same):
     assert reader.counts.malformed == 0
 
 
-def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic):
+def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen):
     truth, sender = traffic(10), FrameSender(path)
     assert sender.send(truth) == 0
     assert not sender.connected

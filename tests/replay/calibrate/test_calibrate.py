@@ -50,9 +50,9 @@ def small(tmp_path_factory):
 TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03")
 
 
-def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
+def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
-    report, found = fitted(small, capsys, *TWO, "-o", str(output), "--scenario", str(world))
+    report, found = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
     assert_true_or_open(found, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025})
     assert found["stall_torque", None]["determined"]
     assert report["converged"]
@@ -67,14 +67,14 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
-def test_a_dead_time_is_reported_and_not_written(small, tmp_path, capsys):
+def test_a_dead_time_is_reported_and_not_written(small, tmp_path, report_of):
     late_s = 0.012
     late_ns = round(late_s * 1e9)
     rewritten(small / "run.mcap", tmp_path / "late.mcap", lambda t, rows: (t + late_ns, rows))
     for name in ("robot.toml", "nominal.toml"):
         (tmp_path / name).write_text((small / name).read_text())
     words = (*TWO, "--delay", "--settle", "1.5", "-o", str(tmp_path / "fitted.toml"))
-    _, found = fitted(tmp_path, capsys, *words, source="late.mcap")
+    _, found = fitted(tmp_path, report_of, *words, source="late.mcap")
     low, high = found["delay", None]["ci95"]
     assert low <= late_s <= high
     assert high - low < 0.004
@@ -118,7 +118,7 @@ def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command
 
 
 @pytest.mark.slow
-def test_a_weak_module_is_found_among_hidden_parameters(tmp_path, capsys):
+def test_a_weak_module_is_found_among_hidden_parameters(tmp_path, report_of):
     hidden = """[servo]
 stall_torque = 0.345
 proportional_gain = 6.8
@@ -132,7 +132,7 @@ mu_normal = 0.42
     room = room_for(tmp_path, 5, 8.0, hidden)
     world = tmp_path / "fitted-world.toml"
     words = ["--modules", "--within", "0.03", "--scenario", str(world)]
-    report, found = fitted(room, capsys, *words, "-o", str(tmp_path / "fitted.toml"))
+    report, found = fitted(room, report_of, *words, "-o", str(tmp_path / "fitted.toml"))
     assert (report["search"]["named"], report["search"]["module"]) == (True, "joint04")
     truth = {"stall_torque": 0.345, "proportional_gain": 6.8, "coulomb_friction": 0.024}
     truth |= {"viscous_friction": 0.005, "gear_stiffness": 12.0, "gear_damping": 0.008}
@@ -151,12 +151,12 @@ mu_normal = 0.42
 
 
 @pytest.mark.slow
-def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, capsys):
+def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, report_of):
     """What the slow wave above leaves open, as it says itself."""
     hidden = "[servo]\nstall_torque = 0.345\nproportional_gain = 6.8\nviscous_friction = 0.006\n"
     room = room_for(tmp_path, 5, 8.0, hidden, gait=(0.5, 2.5))
     words = ["--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
-    report, found = fitted(room, capsys, *words)
+    report, found = fitted(room, report_of, *words)
     names = ("stall_torque", "proportional_gain", "viscous_friction")
     truth = dict(zip(names, (0.345, 6.8, 0.006), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
@@ -165,7 +165,7 @@ def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_with_the_rest_known_servo_and_ground_are_within_three_percent(tmp_path, capsys):
+def test_with_the_rest_known_servo_and_ground_are_within_three_percent(tmp_path, report_of):
     hidden = """[servo]
 stall_torque = 0.27
 proportional_gain = 9.0
@@ -178,7 +178,7 @@ mu_normal = 0.56
     names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
     words = [word for name in names for word in ("--only", name)]
     words += ["--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
-    report, found = fitted(room, capsys, *words)
+    report, found = fitted(room, report_of, *words)
     assert not report["search"]["named"]  # no module differs
     truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
@@ -187,14 +187,14 @@ mu_normal = 0.56
 
 
 @pytest.mark.slow
-def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, capsys, command):
+def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, report_of, command):
     """A motor at constant speed, in the air: one lag for six parameters."""
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
     command("import", TRACE, "--robot", "arcsnake-joint", "-o", tmp_path / "arc.mcap")
     (tmp_path / "nominal.toml").write_text(AIR)
     words = ("--settle", "1", "-o", str(tmp_path / "f.toml"))
-    report, found = fitted(tmp_path, capsys, *words, source="arc.mcap")
+    report, found = fitted(tmp_path, report_of, *words, source="arc.mcap")
     assert not any(one["determined"] for one in found.values())
     assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
     assert report["rms_rad"]["after"] < 0.005  # of a way of 17 rad

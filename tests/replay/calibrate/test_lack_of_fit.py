@@ -150,19 +150,19 @@ def test_joints_without_enough_cycles_are_tested_for_memory():
 ONLY = ("stall_torque", "coulomb_friction", "mu_tangential", "mu_normal")
 
 
-def fitted(folder, capsys, only, *, source="run.mcap", more=()):
+def fitted(folder, report_of, only, *, source="run.mcap", more=()):
     words = [word for name in only for word in ("--only", name)]
     words += [*more, "-o", str(folder / "f.toml")]
-    report, found = twin_fits.fitted(folder, capsys, *words, source=source)
+    report, found = twin_fits.fitted(folder, report_of, *words, source=source)
     return report, {name: one for (name, _), one in found.items()}
 
 
 @pytest.mark.slow
-def test_another_friction_law_excludes_no_truth(tmp_path, capsys):
+def test_another_friction_law_excludes_no_truth(tmp_path, report_of):
     """The robot slips by Transeth's law, the model by the ellipse; the servo is 5 % off."""
     hidden = '[servo]\nstall_torque = 0.315\n[world.ground]\nlaw = "transeth"\n'
     twin_fits.room_for(tmp_path, 5, 8.0, hidden)
-    report, found = fitted(tmp_path, capsys, ONLY)
+    report, found = fitted(tmp_path, report_of, ONLY)
     for name, value in zip(ONLY, (0.315, 0.03, 0.05, 0.5), strict=True):
         ends = found[name]["ci95"]
         assert ends is None or ends[0] <= value <= ends[1], found[name]
@@ -185,11 +185,13 @@ def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_p
 
 
 @pytest.mark.slow
-def test_hidden_play_is_the_first_line(tmp_path, capsys):
+def test_hidden_play_is_the_first_line(tmp_path, report_of):
     """Play of 0.02 rad behind one joint's encoder, as a worn gear has it."""
     twin_fits.room_for(tmp_path, 3, 6.0, "", noise=0.002)
     with_play(tmp_path / "run.mcap", tmp_path / "play.mcap", 0.02)
-    report, found = fitted(tmp_path, capsys, ONLY[:2], source="play.mcap", more=("--settle", "1.5"))
+    report, found = fitted(
+        tmp_path, report_of, ONLY[:2], source="play.mcap", more=("--settle", "1.5")
+    )
     assert not report["fits"]
     assert report["lack_of_fit"]["worst"] == "joint02"
     assert all(one["ci95"] is None and not one["determined"] for one in found.values())
@@ -211,9 +213,9 @@ def with_play(source, target, width):
 
 
 @pytest.mark.slow
-def test_the_right_law_is_left_alone(tmp_path, capsys):
+def test_the_right_law_is_left_alone(tmp_path, report_of):
     twin_fits.room_for(tmp_path, 4, 6.0, "[servo]\nstall_torque = 0.33\n")
-    report, found = fitted(tmp_path, capsys, ONLY)
+    report, found = fitted(tmp_path, report_of, ONLY)
     assert report["fits"]
     assert found["stall_torque"]["ci95"][0] <= 0.33 <= found["stall_torque"]["ci95"][1]
     assert json.dumps(report, allow_nan=False)

@@ -5,65 +5,44 @@ from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 import undulog
+from support.ros_bags import NAMES, OMEGA, filling, header, message, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import MissingChannelError
 from undulog.replay.draw.plots import is_foreign, log_others
 
-EPOCH_NS = 1_700_000_000_000_000_000
-NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]
-OMEGA = 2 * np.pi * 0.8
-JOINTS = "sensor_msgs/msg/JointState"
-TOPICS = {
-    "/snake/targets": JOINTS,
-    "/snake/encoders": JOINTS,
-    "/imu/data": "sensor_msgs/msg/Imu",
-    "/currents": "std_msgs/msg/Float64MultiArray",
-    "/state": "std_msgs/msg/String",
-    "/camera": "sensor_msgs/msg/CompressedImage",
-    "/tf": "tf2_msgs/msg/TFMessage",
-}
+VECTOR = "geometry_msgs/msg/Vector3"
 NAMED = ["--command-topic", "/snake/targets", "--response-topic", "/snake/encoders"]
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     """Five seconds of three joints, an IMU, currents, a state machine, a camera and frames."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    folder = tmp_path_factory.mktemp("foreign") / "bag"
-    vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-    still = turn(x=0.0, y=0.0, z=0.0, w=1.0)
-    none, parts = np.zeros(0), ("orientation", "angular_velocity", "linear_acceleration")
-    unknown = {f"{part}_covariance": np.zeros(9) for part in parts}
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        ways = {t: writer.add_connection(t, kind, typestore=store) for t, kind in TOPICS.items()}
 
-        def write(topic, t_ns, **fields):
-            message = types[TOPICS[topic]](**fields)
-            writer.write(ways[topic], t_ns, store.serialize_cdr(message, TOPICS[topic]))
+    def write(own, t_ns, t_s):
+        phase, store = OMEGA * t_s - np.arange(3), own.bag.store
+        own.state(t_ns, t_s, "/snake/targets", 0.4 * np.sin(phase))
+        own.state(t_ns, t_s, "/snake/encoders", 0.36 * np.sin(phase - 0.2))
 
-        for tick in range(500):
-            t_ns = EPOCH_NS + tick * 10_000_000
-            stamp = types["builtin_interfaces/msg/Time"](sec=t_ns // 10**9, nanosec=t_ns % 10**9)
-            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
-            phase = OMEGA * tick / 100 - np.arange(3)
-            joints = {"header": header, "name": NAMES, "velocity": none, "effort": none}
-            write("/snake/targets", t_ns, **joints, position=0.4 * np.sin(phase))
-            write("/snake/encoders", t_ns, **joints, position=0.36 * np.sin(phase - 0.2))
-            imu = {"header": header, "orientation": still} | unknown
-            imu["angular_velocity"] = vector(x=0.01 * tick, y=0.0, z=0.0)
-            imu["linear_acceleration"] = vector(x=0.0, y=0.0, z=9.81)
-            write("/imu/data", t_ns, **imu)
-            layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
-            write("/currents", t_ns, layout=layout, data=np.array([tick, -tick, 2.0]))
-            if tick % 100 == 0:
-                write("/state", t_ns, data="go" if tick < 300 else "turn")
-                write("/camera", t_ns, header=header, format="png", data=np.zeros(999, np.uint8))
-                write("/tf", t_ns, transforms=[])
+        def other(topic, kind, **fields):
+            own.bag.write(topic, t_ns, message(store, kind, **fields))
+
+        head = header(store, t_ns)
+        still = message(store, "geometry_msgs/msg/Quaternion", w=1.0)
+        turning = message(store, VECTOR, x=t_s)
+        weight = message(store, VECTOR, z=9.81)
+        motion = {"angular_velocity": turning, "linear_acceleration": weight}
+        other("/imu/data", "sensor_msgs/msg/Imu", header=head, orientation=still, **motion)
+        tick = round(100 * t_s)
+        other("/currents", "std_msgs/msg/Float64MultiArray", data=np.array([tick, -tick, 2.0]))
+        if tick % 100 == 0:
+            other("/state", "std_msgs/msg/String", data="go" if tick < 300 else "turn")
+            picture = {"format": "png", "data": np.zeros(999, np.uint8)}
+            other("/camera", "sensor_msgs/msg/CompressedImage", header=head, **picture)
+            other("/tf", "tf2_msgs/msg/TFMessage")
+
+    folder = write_bag(tmp_path_factory.mktemp("foreign") / "bag", filling(write, 5.0))
     (file,) = folder.glob("*.mcap")
     return file
 
@@ -80,7 +59,7 @@ def shown(bag, tmp_path_factory, read_back):
 
 def test_the_joints_are_shown_under_the_names_that_were_given(shown):
     written, recorded = shown
-    assert written["joints"] == NAMES
+    assert written["joints"] == list(NAMES)
     t = recorded.times("/joints/measured") / 1e9
     angle = np.radians(np.array(recorded.column("/joints/measured", "Angle:degrees")))
     truth = 0.36 * np.sin(OMEGA * t[:, None] - np.arange(3) - 0.2)

@@ -89,7 +89,7 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     assert sum(one.is_static for one in static) == 1
 
 
-def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back):
+def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back, opened):
     t_ns = truth.t_ns + np.where(np.arange(len(truth.t_ns)) < 150, 0, 3_000_000_000)
     names = snake25.joint_names
     topics = {
@@ -99,8 +99,7 @@ def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read
     head = np.outer(np.arange(len(t_ns)), [1e-3, 0.0, 0.0])
     path = write_topics(tmp_path / "gap.mcap", t_ns, topics, head=head, robot=snake25)
     _, output = seen_live(path, tmp_path)
-    with Session.open(path) as session:
-        write_recording(session, tmp_path / "replay.rrd")
+    write_recording(opened(path), tmp_path / "replay.rrd")
     seen, expected = read_back(output), read_back(tmp_path / "replay.rrd")
     for entity in (
         "/joints/measured",

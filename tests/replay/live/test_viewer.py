@@ -2,29 +2,24 @@
 
 import re
 import signal
-import subprocess
 import urllib.request
 from pathlib import Path
+from subprocess import DEVNULL
 
 import pytest
 
 from support.live_stage import WAIT_S
-from support.processes import freeze, listening
+from support.processes import freeze, listening, process
 from undulog.replay.viewer import free_ports, viewer_binary
 
 
 @pytest.fixture
-def server(tmp_path):
+def server():
     """Rerun's own gRPC server without a window, on this machine only: (address, process)."""
     (port,) = free_ports(1)
-    process = subprocess.Popen(
-        [viewer_binary(), "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    yield f"rerun+http://127.0.0.1:{port}/proxy", process
-    process.kill()
-    process.wait()
+    words = (viewer_binary(), "--serve-grpc", "--bind", "127.0.0.1", "--port", port)
+    with process(*words, stdout=DEVNULL, stderr=DEVNULL) as running:
+        yield f"rerun+http://127.0.0.1:{port}/proxy", running
 
 
 @pytest.mark.slow

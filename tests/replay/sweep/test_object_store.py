@@ -21,8 +21,7 @@ def bucket(monkeypatch):
 def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
     plan, url = write_plan(tmp_path, (0.1, 0.2), top="sessions = true"), "s3://robots/strength"
     assert undulog("sweep", plan, "-o", tmp_path / "rows").returncode == 0
-    done = undulog("sweep", plan, "-o", url, "--json")
-    assert done.returncode == 0, done.stderr
+    undulog("sweep", plan, "-o", url, "--json", code=0)
     rows = list(RowStore(url).rows())
     assert comparable(rows) == comparable(RowStore(str(tmp_path / "rows")).rows())
     again = json.loads(undulog("sweep", plan, "-o", url, "--json").stdout)
@@ -40,7 +39,6 @@ def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
 @pytest.mark.slow
 @pytest.mark.usefixtures("bucket")
 def test_a_bucket_that_is_not_there_is_named(tmp_path):
-    done = undulog("sweep", write_plan(tmp_path), "-o", "s3://nowhere/strength")
-    assert done.returncode == 1
+    done = undulog("sweep", write_plan(tmp_path), "-o", "s3://nowhere/strength", code=1)
     assert "s3://nowhere/strength" in done.stderr
     assert "Traceback" not in done.stderr

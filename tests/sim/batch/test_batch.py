@@ -5,12 +5,11 @@ import math
 import os
 import pickle
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from support.processes import python
 from support.twin_runs import simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
@@ -56,28 +55,12 @@ def weak():
 @pytest.fixture
 def uneven(make_uneven, make_scenario):
     """A scenario whose links, servos and limits differ, driven in both planes."""
-    robot = make_uneven(6)
-    joints = [
-        dataclasses.replace(
-            joint,
-            servo=dataclasses.replace(
-                joint.servo,
-                stall_torque=0.3 + 0.1 * i,
-                backlash=0.02 * (i % 2),
-                supply_v=6 + i,
-                static_friction=0.05 * (i % 3 == 0),
-            ),
-        )
-        for i, joint in enumerate(robot.joints)
-    ]
-    links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
-    robot = dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
     planes = {
         Plane.HORIZONTAL: PlaneGait(0.4, 0.7, 1.0, offset=0.05),
         Plane.VERTICAL: PlaneGait(0.1, 1.0, 0.5, phase=0.3),
     }
     return make_scenario(
-        robot,
+        make_uneven(6),
         gait=Serpentine(planes, ramp_s=0.5),
         world=World(gravity=(0.4, -0.2, -9.6), heading=0.7, velocity=(0.1, -0.05, 0.02)),
     )
@@ -323,8 +306,7 @@ def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
     runs = [one, dataclasses.replace(one, world=dataclasses.replace(one.world, heading=1.2))]
     (tmp_path / "runs").write_bytes(pickle.dumps(runs))
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
-    command = [sys.executable, "-c", GPU, tmp_path / "runs", tmp_path / "done.npz", "float64"]
-    subprocess.run(command, check=True, env=environment, timeout=300)
+    python(GPU, tmp_path / "runs", tmp_path / "done.npz", "float64", env=environment, code=0)
     expected = [part for one in run_batch(runs) for part in (one.angle, one.work, one.head)]
     assert abs(expected[0][-1]).max() > 1e-3
     with np.load(tmp_path / "done.npz") as found:

@@ -12,7 +12,7 @@ import can
 import numpy as np
 import pytest
 
-from support.can_messages import can_message
+from support.can_messages import can_message, speaking
 from support.processes import wait_for
 from support.twin_runs import sensed, simulate
 from support.written_sessions import write_commands
@@ -308,25 +308,6 @@ def test_any_bus_of_python_can_will_do(tmp_path):
         assert (session.frames("/can/gate_any")["dir"] == DIR_TX).sum() == report.tally.sent
         sent = np.array(session.joints("/joint_commands").values)
     assert np.abs(raw * STEP - sent).max() <= STEP / 2 * (1 + 1e-6)
-
-
-@contextmanager
-def speaking(channel, each):
-    """Somebody on a virtual bus of python-can, every 10 ms."""
-    with can.Bus(interface="virtual", channel=channel) as other:
-        ended = threading.Event()
-
-        def talk():
-            while not ended.wait(0.01):
-                each(other)
-
-        talker = threading.Thread(target=talk)
-        talker.start()
-        try:
-            yield other
-        finally:
-            ended.set()
-            talker.join()
 
 
 def test_another_controller_on_the_bus_is_not_joined(command, tmp_path):

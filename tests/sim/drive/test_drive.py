@@ -342,11 +342,11 @@ def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path, co
 
 
 @pytest.mark.parametrize(("key", "value"), [("heading_rad", "north"), ("run", "-1")])
-def test_a_senseless_plan_is_refused(tmp_path, capsys, key, value):
+def test_a_senseless_plan_is_refused(tmp_path, command, key, value):
     source = planned_commands(tmp_path / "planned.mcap", **{"heading_rad": "0", key: value})
     path = tmp_path / "run.mcap"
-    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) != 0
-    assert f"{key} of its plan is '{value}'" in capsys.readouterr().err
+    err = command("drive", source, "--on", "twin:flat", "-o", path, code=1).err
+    assert f"{key} of its plan is '{value}'" in err
     assert not path.exists()
 
 

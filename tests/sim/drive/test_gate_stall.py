@@ -20,7 +20,7 @@ import pytest
 from support import far_end
 from support.arm_limits import ARM_LIMITS
 from support.far_end import beyond_rate, largest_burst
-from support.processes import start
+from support.processes import process, start
 from support.written_sessions import write_commands
 from undulog.capture import Session, load_robot
 
@@ -71,9 +71,8 @@ def folder(tmp_path_factory):
 class Drive:
     """A drive under way, and what came of it."""
 
-    def __init__(self, robot, router, running, session):
-        self.robot, self.router, self.running = robot, router, running
-        self.path = session
+    def __init__(self, robot, router, session):
+        self.robot, self.router, self.path = robot, router, session
 
     def stop_far_end(self, seconds):
         os.kill(self.robot.pid, signal.SIGSTOP)
@@ -128,22 +127,17 @@ def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=
         running_far_end("robot", kind, period_s, latency_s) as (robot, port),
         running_far_end("router", port) as (router, front),
     ):
-        drive = Drive(robot, router, None, path)
+        drive = Drive(robot, router, path)
         for line in route:
             drive.route(line)
         on = f"can:socketcand:can0?host=127.0.0.1&port={front}&plain=yes"
         words = ["drive", str(folder / f"{which}.mcap"), "--on", on, "--arm", "--json"]
         words += ["-o", str(path), "--duration", str(duration_s)]
-        with start(
-            sys.executable, "-c", DRIVE, *words, env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
-        ) as running:
-            try:
-                drive.running = running
-                assert robot.stdout.readline() == "first\n", running.communicate(timeout=60)
-                time.sleep(1.2)
-                yield drive
-            finally:
-                running.kill()
+        env = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+        with process(sys.executable, "-c", DRIVE, *words, env=env) as drive.running:
+            assert robot.stdout.readline() == "first\n", drive.running.communicate(timeout=60)
+            time.sleep(1.2)
+            yield drive
 
 
 @pytest.mark.parametrize("kind", ["polled", "unasked"])

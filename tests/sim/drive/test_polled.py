@@ -2,14 +2,13 @@
 
 import math
 import struct
-import threading
-from contextlib import contextmanager
 
 import can
 import numpy as np
 import pytest
 
 from support.arm_limits import ARM_LIMITS
+from support.can_messages import speaking
 from support.written_sessions import write_commands
 from undulog.capture import Session, load_robot
 from undulog.capture.bus.encoding import poll_frames
@@ -23,42 +22,24 @@ SHIPPED = load_robot("arcsnake-joint")
 ADDRESS = 0x14B
 
 
-class Servo(threading.Thread):
+class Servo:
     """One motor at its bus: 0x92 asks for the angle, 0xA4 commands one, both are answered."""
 
-    def __init__(self, channel, degrees):
-        super().__init__()
+    def __init__(self, degrees):
         self.degrees, self.temperature, self.received = degrees, 30, []
-        self.ended = threading.Event()
-        self.bus = can.Bus(interface="virtual", channel=channel)
 
-    def run(self):
-        with self.bus:
-            while not self.ended.is_set():
-                if (message := self.bus.recv(0.05)) is not None:
-                    self.answer(bytes(message.data))
-
-    def answer(self, data):
-        self.received.append(data)
-        if data[0] == 0x92:
-            reply = bytes([0x92]) + round(self.degrees * 100).to_bytes(7, "little", signed=True)
-        elif data[0] == 0xA4:
-            self.degrees = struct.unpack("<i", data[4:])[0] / 100
-            reply = struct.pack("<BbhhH", 0xA4, self.temperature, 10, 0, 0)
-        else:
-            return
-        self.bus.send(can.Message(arbitration_id=ADDRESS, data=reply, is_extended_id=False))
-
-
-@contextmanager
-def servo(channel, degrees):
-    one = Servo(channel, degrees)
-    one.start()
-    try:
-        yield one
-    finally:
-        one.ended.set()
-        one.join()
+    def answer(self, bus):
+        while (message := bus.recv(0.05)) is not None:
+            data = bytes(message.data)
+            self.received.append(data)
+            if data[0] == 0x92:
+                reply = bytes([0x92]) + round(self.degrees * 100).to_bytes(7, "little", signed=True)
+            elif data[0] == 0xA4:
+                self.degrees = struct.unpack("<i", data[4:])[0] / 100
+                reply = struct.pack("<BbhhH", 0xA4, self.temperature, 10, 0, 0)
+            else:
+                continue
+            bus.send(can.Message(arbitration_id=ADDRESS, data=reply, is_extended_id=False))
 
 
 @pytest.fixture
@@ -87,7 +68,8 @@ def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():
 
 def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     angles = 0.5 + 0.2 * np.sin(np.arange(121).clip(max=40) / 10)  # then it catches up
-    with servo("polled", math.degrees(0.3)) as one:
+    one = Servo(math.degrees(0.3))
+    with speaking("polled", one.answer):
         report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     requests = [data for data in one.received if data[0] == 0x92]
@@ -107,8 +89,9 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
 
 @pytest.mark.slow
 def test_its_temperature_ends_the_drive(tmp_path, robot):
-    with servo("polled-hot", math.degrees(0.5)) as one:
-        one.temperature = 61
+    one = Servo(math.degrees(0.5))
+    one.temperature = 61
+    with speaking("polled-hot", one.answer):
         plan = planned(tmp_path, robot, "polled-hot", np.full(200, 0.5))
         report = drive_bus(plan, stop=StopRequest())
     assert report.outcome.why.startswith("joint01: temperature 61 degC, more than 60 degC for 0.3")

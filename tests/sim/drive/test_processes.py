@@ -55,12 +55,9 @@ def test_a_recorder_gets_the_gait_through_its_control_socket(tmp_path, alone):
     with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
         words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "--duration", "2", "--json"]
         words += ["-o", str(tmp_path / "driven.mcap")]
-        drove = undulog(*words, env=alone)
-        assert drove.returncode == 0, drove.stderr
-        report = json.loads(drove.stdout)
+        report = json.loads(undulog(*words, env=alone, code=0).stdout)
         assert (report["gait_not_told"], report["gait_told"]) == (None, report["ticks"])
-        stopped = undulog("record", "stop", "--wait", env=alone)
-        assert stopped.returncode == 0, stopped.stderr
+        undulog("record", "stop", "--wait", env=alone, code=0)
     with Session.open(path) as session:
         gait = session.joints("/gait")
         notes = [message.msg for _, message in session.messages("/rosout")]
@@ -119,15 +116,12 @@ def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
         recorded(on, second, alone),
     ):
         words = ("drive", "flat", "--on", on, "--arm", "-o", str(tmp_path / "c.mcap"))
-        drove = undulog(*words, "--duration", "0.2", env=alone)
-        assert drove.returncode == 2
+        drove = undulog(*words, "--duration", "0.2", env=alone, code=2)
         assert "2 recorders run; which one is to receive the gait?" in drove.stderr
         sockets = [line.split()[-1] for line in drove.stderr.splitlines()[1:]]
         chosen = undulog(
-            *(*words, "--duration", "0.2", "--recorder", sockets[1], "--json"),
-            env=alone,
+            *(*words, "--duration", "0.2", "--recorder", sockets[1], "--json"), env=alone, code=0
         )
-        assert chosen.returncode == 0, chosen.stderr
         assert json.loads(chosen.stdout)["recorder"] == sockets[1]
 
 

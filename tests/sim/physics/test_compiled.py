@@ -23,16 +23,7 @@ START = BodyStart((0.3, 0, -9.81), 0.3, 0.7, (0.2, 0.1, 0.0), 1e-3)
 
 @pytest.fixture
 def uneven(make_uneven):
-    """Servos and radii differ too."""
-    robot = make_uneven(6)
-    links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
-    joints = []
-    for i, joint in enumerate(robot.joints):
-        own = {"stall_torque": 0.2 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
-        own["static_friction"] = 0.05 * (i % 3 == 0)
-        servo = dataclasses.replace(joint.servo, **own)
-        joints.append(dataclasses.replace(joint, servo=servo))
-    return dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
+    return make_uneven(6)
 
 
 @pytest.mark.parametrize("law", FrictionLaw)

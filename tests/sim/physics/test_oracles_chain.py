@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.twin_runs import simulate
-from undulog.capture.robot.model import Link, Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Serpentine, World
 from undulog.sim.physics.engine import BodyStart, engine_type
 from undulog.sim.scenario.scenario import EngineKind
@@ -44,13 +44,8 @@ def joint_mass(robot, turn):
 
 
 @pytest.fixture
-def uneven(make_robot):
-    robot = make_robot(6, planar=True)
-    links = tuple(
-        Link(link.name, 0.05 + 0.01 * i, 0.02, 0.1 + 0.03 * i, (6e-5, 6e-5, 6e-5 + 1e-5 * i))
-        for i, link in enumerate(robot.links)
-    )
-    return dataclasses.replace(robot, links=links)
+def uneven(make_uneven):
+    return make_uneven(6, planar=True)
 
 
 @pytest.mark.parametrize("kind", EngineKind)

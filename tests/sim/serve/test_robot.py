@@ -4,6 +4,7 @@ import dataclasses
 import math
 import threading
 import time
+from contextlib import ExitStack, closing
 
 import can
 import numpy as np
@@ -111,15 +112,8 @@ class Running:
 
 @pytest.fixture
 def running():
-    made = []
-
-    def start(*args, **options):
-        made.append(Running(*args, **options))
-        return made[-1]
-
-    yield start
-    for each in made:
-        each.close()
+    with ExitStack() as made:
+        yield lambda *args, **options: made.enter_context(closing(Running(*args, **options)))
 
 
 def positions(robot, frames, quantity=Quantity.POSITION):

@@ -20,6 +20,7 @@ from support.paths import ROOT
 from support.processes import UNDULOG, process, serving, undulog, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot
@@ -65,14 +66,8 @@ to = [0.8, 3.0]
 
 
 def ask(control, **request):
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-        client.settimeout(PATIENCE_S)
-        client.connect(str(control))
-        client.sendall(json.dumps(request).encode() + b"\n")
-        data = b""
-        while not data.endswith(b"\n"):
-            data += client.recv(65536)
-    return json.loads(data)
+    with ControlClient(control, patience_s=PATIENCE_S) as client:
+        return client.ask(request)
 
 
 @contextmanager
@@ -88,13 +83,12 @@ def recorder(source, output):
 
         wait_for(connected, f"the recorder of {source}")
         yield control
-        assert ask(control, do="stop", wait=True)["ok"]
+        ask(control, do="stop", wait=True)
 
 
 def driven(scenario, port, control, *words):
     on = ("--on", f"can:socketcand:can0?port={port}", "--arm", "--recorder", control, "--json")
-    done = undulog("drive", scenario, *on, *words, "-o", control.with_suffix(".drive.mcap"))
-    assert done.returncode == 0, done.stderr
+    done = undulog("drive", scenario, *on, *words, "-o", control.with_suffix(".drive.mcap"), code=0)
     return json.loads(done.stdout)
 
 

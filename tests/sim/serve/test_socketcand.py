@@ -15,8 +15,8 @@ from can.interfaces.socketcand.socketcand import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.can_messages import can_message, frames_of
-from support.processes import wait_for
+from support.can_messages import can_message, frames_of, received, same, traffic
+from support.processes import repeating, wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import (
@@ -34,26 +34,6 @@ from undulog.sim.serve import socketcand_server
 from undulog.sim.serve.socketcand_protocol import ClientText, frame_text, sent_frame
 
 PATIENCE_S = 60.0
-
-
-def traffic(count, seed=1):
-    rng = np.random.default_rng(seed)
-    frames = empty_frames(count)
-    extended = rng.random(count) < 0.3
-    frames["id_flags"] = np.where(
-        extended, rng.integers(0, 2**29, count) | EXTENDED_FLAG, rng.integers(0, 2**11, count)
-    )
-    frames["dlc"] = rng.integers(0, 9, count)
-    data = rng.integers(0, 256, (count, 8))
-    data[np.arange(8) >= frames["dlc"][:, None]] = 0
-    frames["data"] = data
-    frames["t_device_ns"] = np.cumsum(rng.integers(1, 9000, count) * 1000)
-    return frames
-
-
-def same(found, truth):
-    fields = ("id_flags", "dlc", "data")
-    return len(found) == len(truth) and all(np.array_equal(found[f], truth[f]) for f in fields)
 
 
 class Serving:
@@ -104,13 +84,8 @@ def serving():
     made.close()
 
 
-@contextmanager
 def peer(serving):
-    bus = can.Bus(interface="socketcand", host="127.0.0.1", port=serving.port, channel="can0")
-    try:
-        yield bus
-    finally:
-        bus.shutdown()
+    return can.Bus(interface="socketcand", host="127.0.0.1", port=serving.port, channel="can0")
 
 
 @contextmanager
@@ -135,17 +110,11 @@ def read_until(sock, end):
     return data
 
 
-def received(bus, count):
-    messages = [bus.recv(PATIENCE_S) for _ in range(count)]
-    assert all(messages)
-    return messages
-
-
 # -- text ------------------------------------------------------------------------------------
 
 
 def test_what_the_server_writes_both_clients_read_alike():
-    truth = traffic(500)
+    truth = traffic(500, 0)
     text = frame_text(truth)
     tally = Tally(lambda: 0)
     found = SocketcandText().feed(text, 5, tally)
@@ -196,16 +165,16 @@ def test_remote_requests_have_a_length_and_no_data():
 
 
 def test_frames_go_to_everyone_but_their_sender(serving):
-    own, other = traffic(300, 1), traffic(200, 2)
+    own, other = traffic(300, 0), traffic(200, 0)
     with peer(serving) as first, peer(serving) as second:
         wait_for(lambda: serving.raw() == 2, "two clients")
         serving.send(own)
-        assert same(frames_of(received(first, 300)), own)
-        assert same(frames_of(received(second, 300)), own)
+        assert same(received(first, 300)[1], own)
+        assert same(received(second, 300)[1], own)
         for frame in other:
             first.send(can_message(frame))
-        messages = received(second, 200)
-        assert same(frames_of(messages), other)
+        messages, frames = received(second, 200)
+        assert same(frames, other)
         assert {message.timestamp for message in messages} == {12.345678}
         wait_for(lambda: len(serving.frames()) == 200, "all frames at the robot")
         assert same(serving.frames(), other)
@@ -213,7 +182,7 @@ def test_frames_go_to_everyone_but_their_sender(serving):
 
 
 def test_our_own_source_records_the_bus(serving, tmp_path):
-    own, other = traffic(300, 3), traffic(100, 4)
+    own, other = traffic(300, 0), traffic(100, 0)
     source = open_source(parse_address(f"can:socketcand:can0?port={serving.port}"))
     with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=time.time_ns()) as writer:
         source.start(SourceContext(time.monotonic_ns, writer))
@@ -239,23 +208,11 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
 
 
 def test_pythons_client_can_join_a_busy_bus(serving):
-    own = traffic(20, 5)
-    stop = threading.Event()
-
-    def chatter():
-        while not stop.is_set():
-            serving.send(own)
-            time.sleep(0.001)
-
-    thread = threading.Thread(target=chatter)
-    thread.start()
-    try:
+    own = traffic(20, 0)
+    with repeating(lambda: serving.send(own), 0.001):
         for _ in range(10):
             with peer(serving) as bus:
                 assert bus.recv(PATIENCE_S) is not None
-    finally:
-        stop.set()
-        thread.join()
 
 
 # -- manners ---------------------------------------------------------------------------------
@@ -286,14 +243,14 @@ def test_answers_are_those_of_the_protocol(serving):
 
 
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
-    own = traffic(1000, 6)
+    own = traffic(1000, 0)
     with hand(serving, b"open can0", b"rawmode"), peer(serving) as good:
         wait_for(lambda: serving.raw() == 2, "two clients")
         sent = 0
         while not serving.server.dropped:
             serving.send(own)
             sent += 1000
-            assert len(received(good, 1000)) == 1000
+            assert len(received(good, 1000)[1]) == 1000
             assert sent < 2_000_000
     warnings = [text for level, text in serving.events if level == "warn"]
     assert len(warnings) == 1
@@ -310,7 +267,7 @@ def test_a_client_that_makes_no_sense_is_let_go(serving):
 def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(serving):
     with serving.lock:
         serving.pulling = False
-    many = traffic(60_000, 7)
+    many = traffic(60_000, 0)
     text = "".join(convert_can_message_to_ascii_message(can_message(frame)) for frame in many)
     with hand(serving, b"open can0") as sock:
         thread = threading.Thread(target=sock.sendall, args=(text.encode(),))
@@ -326,7 +283,7 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
 
 
 def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(serving):
-    own = traffic(40, 8)
+    own = traffic(40, 0)
     with serving.lock:
         serving.pulling = False
         serving.server.identity = "virtual-robot snake25 paced"
@@ -360,7 +317,7 @@ def test_no_more_clients_than_there_is_room_for(serving):
 @pytest.mark.parametrize("words", [(), (b"open can0",)], ids=["nothing", "open"])
 def test_silent_clients_lock_nobody_out(serving, words):
     """Whoever connects and stays silent gives way; who works on the bus stays."""
-    frames = traffic(50)
+    frames = traffic(50, 0)
     with ExitStack() as clients:
         worker = clients.enter_context(hand(serving, b"open can0", b"rawmode"))
         for _ in range(3 * socketcand_server.MOST_CLIENTS):
@@ -368,10 +325,10 @@ def test_silent_clients_lock_nobody_out(serving, words):
         late = clients.enter_context(peer(serving))
         wait_for(lambda: serving.raw() == 2, "both in raw mode")
         serving.send(frames)
-        found = received(late, len(frames))
+        _, found = received(late, len(frames))
         text = frame_text(frames)
         assert read_until(worker, text[-40:]) == text
-    assert same(frames_of(found), frames[(frames["id_flags"] & REMOTE_FLAG) == 0])
+    assert same(found, frames)
 
 
 def test_only_loopback_is_served():

@@ -328,8 +328,7 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, name, command):
 
 def test_a_full_disk_leaves_nothing_and_no_traceback(disk_of):
     disk = disk_of("400k")
-    done = undulog("sim", "run", "flat", "-o", disk / "run.mcap", "--duration", "60")
-    assert done.returncode == 1
+    done = undulog("sim", "run", "flat", "-o", disk / "run.mcap", "--duration", "60", code=1)
     assert re.search(r"run\.mcap.*No space left", done.stderr)
     assert "Traceback" not in done.stderr
     assert list(disk.iterdir()) == []

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter
+from support.written_topics import EPOCH_NS, write_topics
+from undulog.capture import Session
 
-EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 26)]
 TICKS = 24_000
 COLUMN_BYTES = TICKS * len(NAMES) * 8
@@ -22,12 +22,9 @@ def values():
 
 @pytest.fixture(scope="module")
 def session_path(tmp_path_factory, values):
-    path = tmp_path_factory.mktemp("columns") / "s.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
-        for tick, row in enumerate(values):
-            states.write(EPOCH_NS + tick * 10_000_000, row, -row, 2 * row)
-    return path
+    topics = {"/joint_states": (NAMES, "rad", values, -values, 2 * values)}
+    t_ns = EPOCH_NS + np.arange(TICKS) * 10_000_000
+    return write_topics(tmp_path_factory.mktemp("columns") / "s.mcap", t_ns, topics)
 
 
 def resident():

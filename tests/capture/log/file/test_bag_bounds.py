@@ -9,24 +9,18 @@ import lz4.frame
 import pytest
 from hostile_logs import zeros
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from support.ros_bags import Filler, ticks, write_bag
+from support.ros_bags import BY_FILE, BY_MESSAGE, Filler, filling, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import NotALogError
 
 pytestmark = pytest.mark.usefixtures("scratch")
 MIB = 1 << 20
-BY_FILE, BY_MESSAGE = (
-    (mode, CompressionFormat.ZSTD) for mode in (CompressionMode.FILE, CompressionMode.MESSAGE)
-)
 BOMB = zeros(200 * MIB)
 
 
-def fill(bag):
-    own = Filler(bag)
-    for tick in ticks(0.3):
-        own.state(*tick)
+fill = filling(Filler.state, 0.3)
 
 
 def refused(path, match):

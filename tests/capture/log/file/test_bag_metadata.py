@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from support.ros_bags import Filler, ticks, write_bag
+from support.ros_bags import Filler, filling, write_bag
 from undulog.capture import Session
 from undulog.capture.commands.sessions import sessions_of
 from undulog.capture.common.errors import LogError
@@ -72,11 +72,7 @@ def test_a_huge_file_or_a_pipe_is_not_read(tmp_path):
 
 
 def test_logs_beside_a_metadata_yaml_of_another_tool_are_found(tmp_path):
-    def fill(bag):
-        for tick in ticks(0.2):
-            Filler(bag).state(*tick)
-
-    write_bag(tmp_path / "bag", fill)
+    write_bag(tmp_path / "bag", fill := filling(Filler.state, 0.2))
     (tmp_path / "bag/metadata.yaml").rename(tmp_path / "bag/old.yaml")
     (tmp_path / "bag/metadata.yaml").write_text("name: a tool\n")
     (tmp_path / "bag/bag.mcap").rename(tmp_path / "bag/one.mcap")

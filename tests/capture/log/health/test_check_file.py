@@ -10,6 +10,7 @@ from mcap.writer import CompressionType, IndexType
 from support.checked_sessions import EPOCH_NS, NAMES, ROBOT, TICKS, at, gait, timing_of, write_raw
 from support.read_back import chunks_of
 from support.written_sessions import joint_state, write_foreign
+from support.written_topics import write_topics
 from undulog.capture import SessionWriter
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.chunk import walk_records
@@ -146,13 +147,12 @@ def test_missing_contract_topics_are_named(tmp_path):
 
 
 def test_a_joint_without_samples_is_named(tmp_path):
-    path = tmp_path / "s.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES[:-1], unit="rad")
-        for tick in range(300):
-            commands.write(at(tick), gait(tick))
-            states.write(at(tick), gait(tick)[:-1] + 1e-3 * np.sin(tick))
+    ticks = np.arange(300)
+    commands = np.array([gait(tick) for tick in ticks])
+    states = commands[:, :-1] + 1e-3 * np.sin(ticks)[:, None]
+    topics = {"/joint_commands": (NAMES, "rad", commands)}
+    topics["/joint_states"] = (NAMES[:-1], "rad", states)
+    path = write_topics(tmp_path / "s.mcap", at(ticks), topics, epoch_ns=EPOCH_NS, robot=ROBOT)
     assert check_session(path).reasons == ("/joint_states never carries joint25",)
 
 

@@ -114,6 +114,15 @@ def test_helper_threads_change_no_byte(calls, chunk_size, waiting):
     assert threaded == written(McapWriter, calls, chunk_size)
 
 
+def numbers_in(stream):
+    """Sequence numbers of the messages of a file that has no end yet."""
+    found = []
+    with contextlib.suppress(EndOfFile):
+        for one in StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records:
+            found += [one.sequence] if isinstance(one, Message) else []
+    return found
+
+
 @settings(max_examples=50, deadline=None)
 @given(sizes=st.lists(st.integers(0, 300), max_size=60), waiting=st.integers(0, 1500))
 def test_what_is_settled_with_helpers_is_in_the_file(sizes, waiting):
@@ -125,11 +134,7 @@ def test_what_is_settled_with_helpers_is_in_the_file(sizes, waiting):
         channel = writer.register_channel("/a", "cdr", 0)
         for number, size in enumerate(sizes):
             writer.add_message(channel, number, bytes(size), number, number)
-            records = StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records
-            found = []
-            with contextlib.suppress(EndOfFile):
-                found.extend(one.sequence for one in records if isinstance(one, Message))
-            assert found == [*range(writer.settled)]
+            assert numbers_in(stream) == [*range(writer.settled)]
         writer.settle(writer.messages)
         assert writer.settled == len(sizes)
         writer.finish()
@@ -205,9 +210,7 @@ def test_groups_have_chunks_of_their_own_and_what_is_settled_is_in_the_file(
             writer.settle(k // 2)
             assert writer.settled >= k // 2
         assert 0 <= writer.settled <= writer.messages == k + 1
-        records = StreamReader(io.BytesIO(stream.getvalue())).records
-        there = {each.sequence for each in until_the_end(records) if isinstance(each, Message)}
-        assert set(range(writer.settled)) <= there
+        assert set(range(writer.settled)) <= set(numbers_in(stream))
     writer.finish()
     reader = make_reader(io.BytesIO(stream.getvalue()))
     found = [(c.id, m.sequence, m.data) for _, c, m in reader.iter_messages()]
@@ -215,9 +218,3 @@ def test_groups_have_chunks_of_their_own_and_what_is_settled_is_in_the_file(
     for chunk in reader.get_summary().chunk_indexes:
         topics = [key for key in chunk.message_index_offsets if ids.index(key) % 2 == 0]
         assert not topics or list(chunk.message_index_offsets) == topics[:1]
-
-
-def until_the_end(records):
-    """Records of a file that has no end yet."""
-    with contextlib.suppress(EndOfFile):
-        yield from records

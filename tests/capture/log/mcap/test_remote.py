@@ -3,6 +3,7 @@
 import json
 import os
 import random
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,17 @@ def chunked(session, tmp_path_factory):
     return path
 
 
+@contextmanager
+def both(path):
+    """A web server of a file, and the session that it is, from there and from here."""
+    with (
+        web_server(files={f"lab/{path.name}": path.read_bytes()}) as server,
+        Session.open(server.url(f"lab/{path.name}")) as far,
+        Session.open(path) as near,
+    ):
+        yield server, far, near
+
+
 def assert_same(ours, other):
     assert ours.metadata == other.metadata
     assert ours.attachments == other.attachments
@@ -88,11 +100,7 @@ def test_other_paths_stay_what_they_are(given):
 
 
 def test_a_session_on_a_web_server_reads_as_its_file_does(session):
-    with (
-        web_server(files={"lab/run.mcap": session.read_bytes()}) as server,
-        Session.open(server.url("lab/run.mcap")) as far,
-        Session.open(session) as near,
-    ):
+    with both(session) as (server, far, near):
         assert_same(far, near)
         assert far.warnings == near.warnings
         assert far.size == session.stat().st_size
@@ -112,11 +120,7 @@ def test_a_session_on_a_web_server_reads_as_its_file_does(session):
 def test_files_of_another_make_read_as_they_do_here(session, tmp_path, options):
     path = tmp_path / "foreign.mcap"
     rewrite(session, path, **options)
-    with (
-        web_server(files={"f.mcap": path.read_bytes()}) as server,
-        Session.open(server.url("f.mcap")) as far,
-        Session.open(path) as near,
-    ):
+    with both(path) as (_, far, near):
         assert_same(far, near)
         assert far.warnings == near.warnings
 
@@ -124,41 +128,28 @@ def test_files_of_another_make_read_as_they_do_here(session, tmp_path, options):
 def test_a_cut_file_is_fetched_whole_and_read_as_far_as_it_goes(session, tmp_path):
     path = tmp_path / "cut.mcap"
     path.write_bytes(session.read_bytes()[:-30_000])
-    with (
-        web_server(files={"cut.mcap": path.read_bytes()}) as server,
-        Session.open(server.url("cut.mcap")) as far,
-        Session.open(path) as near,
-    ):
+    with both(path) as (_, far, near):
         assert_same(far, near)
         assert [w.replace(str(far.path), "") for w in far.warnings] == near.warnings
 
 
 def test_a_window_fetches_a_part_and_a_second_look_nothing(chunked):
-    data = chunked.read_bytes()
     window = {"start_ns": T0 + 40_000_000_000, "stop_ns": T0 + 41_000_000_000}
-    with (
-        web_server(files={"run.mcap": data}) as server,
-        Session.open(server.url("run.mcap")) as far,
-        Session.open(chunked) as near,
-    ):
+    with both(chunked) as (server, far, near):
         opened = server.sent
         got, want = (one.joints("/joint_states", **window) for one in (far, near))
         assert all(map(np.array_equal, got.values, want.values))
         fetched = server.sent
-        assert fetched - opened < 0.35 * len(data)
+        assert fetched - opened < 0.35 * near.size
         far.joints("/joint_states", **window)
         assert server.sent == fetched
 
 
 def test_whole_reading_takes_few_requests_and_each_byte_once(chunked):
-    data = chunked.read_bytes()
-    with (
-        web_server(files={"run.mcap": data}) as server,
-        Session.open(server.url("run.mcap")) as far,
-    ):
+    with both(chunked) as (server, far, near):
         assert len(far.chunk_times_ns[0]) > 20
         far.columns({"/joint_states": ["position"], "/joint_commands": ["position"]}, {})
-        assert server.sent < 1.1 * len(data) + 200_000
+        assert server.sent < 1.1 * near.size + 200_000
         assert len(server.asked) < 10
 
 
@@ -217,29 +208,21 @@ def test_a_server_that_is_gone_is_an_error():
     ],
 )
 def test_an_object_that_changes_or_stops_midway_is_an_error(session, attribute, value, why):
-    with (
-        web_server(files={"run.mcap": session.read_bytes()}) as server,
-        Session.open(server.url("run.mcap")) as far,
-    ):
+    with both(session) as (server, far, _):
         setattr(server, attribute, value)
         with pytest.raises(InputFileError, match=why):
             far.joints("/joint_states")
 
 
-def test_a_damaged_chunk_is_left_out_and_named(chunked, tmp_path):
+def test_a_damaged_chunk_is_left_out_and_named(chunked, tmp_path, opened):
     data = bytearray(chunked.read_bytes())
-    with Session.open(chunked) as near:
-        middle = len(near.chunk_times_ns[0]) // 2
+    middle = len(opened(chunked).chunk_times_ns[0]) // 2
     with chunked.open("rb") as stream:
         index = make_reader(stream).get_summary().chunk_indexes[middle]
     data[index.chunk_start_offset + index.chunk_length // 2] ^= 0xFF
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
-    with (
-        web_server(files={"damaged.mcap": bytes(data)}) as server,
-        Session.open(server.url("damaged.mcap")) as far,
-        Session.open(path) as near,
-    ):
+    with both(path) as (_, far, near):
         assert_same(far, near)
         assert [w.replace(str(far.path), str(near.path)) for w in far.warnings] == near.warnings
         assert any("its messages are missing" in warning for warning in far.warnings)

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
+from support.read_back import decoded_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.log.messages.definitions import CONTRACT_VERSION
 
@@ -26,9 +25,7 @@ def session_file(request, tmp_path):
 
 def positions(path):
     """Joints and positions [rad], shape (n, m), by the format's own reader."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        messages = [m for *_, m in reader.iter_decoded_messages("/joint_states")]
+    messages = [m for *_, m in decoded_of(path, ["/joint_states"])]
     return list(messages[0].name), np.array([message.position for message in messages])
 
 
@@ -113,12 +110,11 @@ def test_a_killed_recording_is_put_together_and_recovered(tmp_path, command):
 @pytest.mark.parametrize(
     ("version", "warns"), [("1", False), ("2", True), ("9" * 40, True), ("", False), ("x", False)]
 )
-def test_a_session_of_a_later_contract_is_read_with_a_warning(tmp_path, version, warns):
+def test_a_session_of_a_later_contract_is_read_with_a_warning(tmp_path, version, warns, opened):
     path = tmp_path / "later.mcap"
     facts = {"contract": version}
     with SessionWriter(path, session_id="a", epoch_ns=0, metadata=facts) as writer:
         writer.joint_state("/joint_states", ["a"], unit="rad")
-    with Session.open(path) as session:
-        found = [text for text in session.warnings if "of the log contract" in text]
+    found = [text for text in opened(path).warnings if "of the log contract" in text]
     assert bool(found) == warns
     assert all(f"reads up to {CONTRACT_VERSION}:" in text for text in found)

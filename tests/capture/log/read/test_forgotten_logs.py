@@ -5,7 +5,7 @@ import pytest
 
 from support.paths import ROOT
 from support.processes import python
-from undulog.capture import SessionWriter
+from support.written_topics import EPOCH_NS, write_topics
 from undulog.capture.log.mcap.payloads import McapPayloads
 
 READS = """
@@ -36,11 +36,9 @@ print("read")
 
 
 def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path):
-    path = tmp_path / "some.mcap"
-    with SessionWriter(path, session_id="some", epoch_ns=1_735_689_600_000_000_000) as writer:
-        states = writer.joint_state("/joint_states", ("a", "b"), unit="rad")
-        for tick in range(100):
-            states.write(1_735_689_600_000_000_000 + tick * 10_000_000, np.zeros(2))
+    topics = {"/joint_states": (("a", "b"), "rad", np.zeros((100, 2)))}
+    t_ns = EPOCH_NS + np.arange(100) * 10_000_000
+    path = write_topics(tmp_path / "some.mcap", t_ns, topics)
     done = python(READS, path, cwd=ROOT)
     assert done.stdout == "read\n", done.stderr
 

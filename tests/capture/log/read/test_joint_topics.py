@@ -7,23 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.ros_bags import EPOCH_NS, NAMES, STATE, Filler, header, message, ticks, write_bag
+from support.ros_bags import EPOCH_NS, NAMES, filling, message, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.log.read.joint_messages import Trajectory, joint_source, points_in_force
 
 
 def opened(tmp_path, fill):
-    def filled(bag):
-        own = Filler(bag)
-        for tick in ticks(0.2):
-            fill(own, tick)
-
-    return Session.open(write_bag(tmp_path / "bag", filled))
+    return Session.open(write_bag(tmp_path / "bag", filling(fill, 0.2)))
 
 
 def test_the_names_of_the_contract_come_first(tmp_path):
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick)
         own.state(*tick, "/joint_commands")
         own.controller(*tick)
@@ -42,19 +37,11 @@ def test_the_names_of_the_contract_come_first(tmp_path):
 def test_commands_are_those_of_the_same_joints(tmp_path):
     """A gripper's controller has more messages than that of the arm, and none of its joints."""
 
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick)
         own.controller(*tick, "/arm/controller_state")
         for step in (0, 1):
-            store = own.bag.store
-            sample = message(
-                store,
-                STATE,
-                header=header(store, tick[0] + step),
-                name=["finger"],
-                position=np.zeros(1),
-            )
-            own.bag.write("/gripper/joint_commands", tick[0] + step, sample)
+            own.state(tick[0] + step, 0.0, "/gripper/joint_commands", [0.0], ["finger"])
 
     with opened(tmp_path, fill) as session:
         found = session.joint_topics()
@@ -63,13 +50,9 @@ def test_commands_are_those_of_the_same_joints(tmp_path):
 
 
 def test_states_of_other_joints_give_way_to_those_of_the_controller(tmp_path):
-    def fill(own, tick):
+    def fill(own, *tick):
         own.controller(*tick)
-        store = own.bag.store
-        sample = message(
-            store, STATE, header=header(store, tick[0]), name=["finger"], position=np.zeros(1)
-        )
-        own.bag.write("/joint_states", tick[0], sample)
+        own.state(*tick, positions=[0.0], names=["finger"])
 
     with opened(tmp_path, fill) as session:
         assert session.joint_topics().response == "/arm/controller_state.feedback"
@@ -77,7 +60,7 @@ def test_states_of_other_joints_give_way_to_those_of_the_controller(tmp_path):
 
 
 def test_states_that_could_be_either_are_not_taken(tmp_path):
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick, "/left")
         own.state(*tick, "/right")
 
@@ -92,7 +75,7 @@ def test_states_that_could_be_either_are_not_taken(tmp_path):
 def test_the_array_of_a_robot_has_its_joints(tmp_path):
     """Three values and a robot of 25 joints: refused; of the same number: taken, and reported."""
 
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick)
         own.array(*tick)
 
@@ -113,7 +96,7 @@ def test_the_array_of_a_robot_has_its_joints(tmp_path):
 
 
 def test_names_without_joints_are_refused(tmp_path):
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick)
         own.bag.write("/word", tick[0], message(own.bag.store, "std_msgs/msg/String", data="x"))
 
@@ -163,7 +146,7 @@ def test_a_later_trajectory_replaces_what_is_not_yet_due(drawn):
 
 
 def test_stamps_of_trajectories_are_on_the_clock_of_the_log(tmp_path):
-    def fill(own, tick):
+    def fill(own, *tick):
         own.state(*tick)
         own.trajectory(*tick, "/stamped")
         own.trajectory(*tick, "/unstamped", stamped=False)

@@ -157,7 +157,7 @@ def test_more_joints_than_a_robot_has_are_an_error(tmp_path, verb, command):
     assert not list(tmp_path.glob("x.*"))
 
 
-def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(tmp_path, command):
+def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(tmp_path, command, opened):
     log = HostileLog()
     kind = log.schema()
     for number in range(600):
@@ -170,8 +170,7 @@ def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(tmp_path, co
     ]
     log.chunk(rows)
     path = log.write(tmp_path / "many.mcap")
-    with Session.open(path) as session:
-        drawn, left_out = drawn_topics(session)
+    drawn, left_out = drawn_topics(opened(path))
     assert (len(drawn), left_out) == (100, 501)
     assert "/joint_states" in drawn
     every = [word for topic in range(600) for word in ("--topics", f"/t{topic}")]

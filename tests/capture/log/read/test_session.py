@@ -10,6 +10,7 @@ from rosbags.highlevel import AnyReader
 from support.read_back import decoded_of, metadata_of
 from support.written_frames import frames_of
 from support.written_sessions import EPOCH_NS, NAMES, STEP_NS, write_session
+from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.messages.frames import DIR_TX, EXTENDED_FLAG, empty_frames
@@ -158,18 +159,13 @@ def test_frames_come_back_bit_for_bit(tmp_path):
 
 def test_each_joint_gets_its_own_sampling_time(tmp_path):
     path = tmp_path / "s.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        states = writer.joint_state("/joint_states", NAMES, unit="rad")
-        offsets = writer.joint_state("/joint_sample_offset", NAMES, unit="s")
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        for tick in range(10):
-            t_ns = EPOCH_NS + tick * STEP_NS
-            states.write(t_ns, [1, 2, 3])
-            commands.write(t_ns, [1, 2, 3])
-            offsets.write(t_ns, [0.0, 0.005, 0.001 * tick])
-    with Session.open(path) as session:
+    base = EPOCH_NS + np.arange(10) * STEP_NS
+    angles = np.tile([1.0, 2.0, 3.0], (10, 1))
+    offsets = [[0.0, 0.005, 0.001 * tick] for tick in range(10)]
+    topics = {f"/joint_{kind}": (NAMES, "rad", angles) for kind in ("states", "commands")}
+    topics["/joint_sample_offset"] = (NAMES, "s", offsets)
+    with Session.open(write_topics(path, base, topics, epoch_ns=EPOCH_NS)) as session:
         signals = session.joints("/joint_states")
-        base = EPOCH_NS + np.arange(10) * STEP_NS
         np.testing.assert_array_equal(signals.t_ns[0], base)
         np.testing.assert_array_equal(signals.t_ns[1], base + 5_000_000)
         np.testing.assert_array_equal(signals.t_ns[2], base + np.arange(10) * 1_000_000)

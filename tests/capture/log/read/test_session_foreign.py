@@ -102,10 +102,10 @@ def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path
         assert "2 names but 1 values of position" in session.warnings[0]
 
 
-def test_nan_samples_are_kept(tmp_path):
+def test_nan_samples_are_kept(tmp_path, opened):
     messages = [states(EPOCH_NS, ["a"], [float("nan")])]
-    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
-        assert np.isnan(session.joints("/joint_states").values[0]).all()
+    session = opened(write_foreign(tmp_path / "f.mcap", messages))
+    assert np.isnan(session.joints("/joint_states").values[0]).all()
 
 
 def test_zero_stamps_fall_back_to_log_times(tmp_path):
@@ -159,7 +159,7 @@ def test_any_kind_of_mcap_reads_the_same(tmp_path, options, warned):
         assert bool(session.warnings) == warned
 
 
-def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
+def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path, opened):
     plain = hostile_logs.joint_state(EPOCH_NS, ["ab"], [1.5])
     padding_at = 4 + 8 + 4 + 1  # header, stamp, length of frame_id, its terminating zero
     assert plain[padding_at : padding_at + 3] == bytes(3)
@@ -171,5 +171,4 @@ def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
             writer.add_message(channel, EPOCH_NS + k, bytes(message), EPOCH_NS + k)
     record = Schema(1, schema_text(JOINT_STATE).encode(), "ros2msg", JOINT_STATE)
     assert list(DecoderFactory().decoder_for("cdr", record)(bytes(message)).position) == [1.5]
-    with Session.open(tmp_path / "f.mcap") as session:
-        assert session.joints("/joint_states").values[0].tolist() == [1.5] * 20
+    assert opened(tmp_path / "f.mcap").joints("/joint_states").values[0].tolist() == [1.5] * 20

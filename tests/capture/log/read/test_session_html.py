@@ -2,6 +2,9 @@
 
 import xml.etree.ElementTree as ET
 
+import numpy as np
+
+from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 
 
@@ -12,11 +15,9 @@ def shown(path):
 
 
 def test_topics_are_rows_with_counts_rates_and_units(tmp_path):
-    with SessionWriter(tmp_path / "run.mcap", session_id="a", epoch_ns=0) as writer:
-        states = writer.joint_state("/joint_states", ["a", "b"], unit="rad")
-        for k in range(11):
-            states.write(k * 100_000_000, [0.0, 0.0])
-    html, tree = shown(tmp_path / "run.mcap")
+    topics = {"/joint_states": (["a", "b"], "rad", np.zeros((11, 2)))}
+    path = write_topics(tmp_path / "run.mcap", np.arange(11) * 10**8, topics, epoch_ns=0)
+    html, tree = shown(path)
     rows = [[cell.text for cell in row] for row in tree.iter("tr")]
     assert ["/joint_states", "sensor_msgs/msg/JointState", "11", "11", "rad"] in rows
     assert "run.mcap: no robot description, 1.00 s from 1970-01-01 00:00:00 UTC" in html

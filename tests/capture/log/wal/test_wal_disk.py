@@ -98,9 +98,7 @@ print(accepted)
 
 @pytest.mark.parametrize("then", ["close", "release"])
 def test_a_full_disk_is_an_error_that_loses_nothing(small_disk, then):
-    done = python(FILL, small_disk / "w", then)
-    assert done.returncode == 0, done.stderr
-    report, again, last = done.stdout.splitlines()
+    report, again, last = python(FILL, small_disk / "w", then, code=0).stdout.splitlines()
     accepted, foreseen, error = report.split("|")
     assert (foreseen, again) == ("True", "again")
     shortage = r"needs 65536 bytes and the disk has \d+ free: \d+ bytes are missing"
@@ -126,8 +124,7 @@ def test_a_limit_on_file_size_is_an_error_not_a_signal(tmp_path):
     def limited():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    done = python(FILL, tmp_path / "w", "close", preexec_fn=limited)
-    assert done.returncode == 1
+    done = python(FILL, tmp_path / "w", "close", preexec_fn=limited, code=1)
     assert "LogWriteError" in done.stderr
     assert "can't be reserved: File too large" in done.stderr
     assert not (tmp_path / "w").exists()

@@ -237,8 +237,7 @@ except LogWriteError as error:
 
 
 def fill(place, ballast, split_size=0, hog="never"):
-    done = python(FILL, recorder.__file__, place, ballast, split_size, hog)
-    assert done.returncode == 0, done.stderr
+    done = python(FILL, recorder.__file__, place, ballast, split_size, hog, code=0)
     report, end = done.stdout.splitlines()
     accepted, foreseen, error = report.split("|")
     assert foreseen == "True"
