@@ -85,12 +85,12 @@ def find_excitation(command: Series) -> Excitation | None:
     """
     if command.count < LEAST_SAMPLES or np.ptp(command.values) == 0:
         return None
-    t_s, step = even_times(command.t_s[0], command.t_s[-1], command.period_s)
-    even = resampled(command, t_s)
+    # At its own sampling interval, so that steps stay between the same samples of each period.
+    even = resampled(command, np.arange(command.t_s[0], command.t_s[-1], command.period_s))
     values = even - np.mean(command.values)
     tones = find_tones(command, even)
     repeated = _period(values) if tones is None or tones.size > 1 else None
-    period_s = float("nan") if repeated is None else repeated * step
+    period_s = float("nan") if repeated is None else repeated * command.period_s
     if repeated is not None:
         kind = Kind.PERIODIC
     elif tones is not None:
@@ -132,9 +132,10 @@ def _period(values: FloatArray) -> float | None:
     bend = np.maximum(before - 2 * at + after, np.finfo(float).tiny)
     beside = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
     likely = np.flatnonzero(at - 0.25 * (before - after) * beside < _LIKELY)[:_MOST_TRIED]
-    for lag, known in zip((lags[least] + beside)[likely], at[likely], strict=True):
-        if known < REPEATED or _differ(values, lag) < REPEATED:
-            return float(lag)
+    for start, known in zip((lags[least] + beside)[likely], at[likely], strict=True):
+        lag, left = _exact_lag(values, float(start))
+        if min(known, left) < REPEATED:
+            return lag if left <= known else float(np.rint(start))
     return None
 
 
@@ -145,12 +146,24 @@ def _minima(values: FloatArray, first: int) -> IntArray:
     return found[found > first]
 
 
-def _differ(values: FloatArray, lag: float) -> float:
-    """Return sum (u(t + L) - u(t))^2 over its mean square, for a lag between two samples."""
-    at = np.arange(values.size, dtype=np.float64)
-    shared = int(values.size - 1 - lag)
-    later, now = resampled(Series("u", at, values), at[:shared] + lag), values[:shared]
-    return float(np.sum((later - now) ** 2) / np.sum(later**2 + now**2))
+def _exact_lag(values: FloatArray, lag: float) -> tuple[float, float]:
+    """Return the lag of least difference between two samples, and the difference there.
+
+    The step of Gauss and Newton from the parabola's vertex; sum (u(t + L) - u(t))^2 over its mean
+    square.
+    """
+    from scipy.interpolate import CubicSpline
+
+    place = np.arange(values.size, dtype=np.float64)
+    curve, slope = (one := CubicSpline(place, values)), one.derivative()
+    place = place[: int(values.size - 2 - lag)]
+    now = values[: place.size]
+    rate = slope(place + lag)
+    power = float(rate @ rate)
+    step = float(rate @ (curve(place + lag) - now)) / power if power > 0 else 0.0
+    lag -= min(max(step, -0.5), 0.5)
+    later = curve(place + lag)
+    return lag, float(np.sum((later - now) ** 2) / np.sum(later**2 + now**2))
 
 
 def _is_chirp(values: FloatArray) -> bool:

@@ -41,7 +41,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import next_fast_len
+from scipy.fft import next_fast_len, prev_fast_len
 from scipy.special import fdtri
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -135,8 +135,9 @@ def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
 
     Args:
         command: At least 32 samples.
-        even: The same at :func:`even_times` of all its stretch.
+        even: The same at even steps of its sampling interval.
     """
+    even = even[: prev_fast_len(even.size)]
     place = np.linspace(-1.0, 1.0, even.size)
     values = even - even.mean()
     values -= place * (place @ values) / (place @ place)
@@ -151,7 +152,7 @@ def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
         return None
     if not 0 < peaks.size <= MOST_TONES or (np.diff(peaks) < SEPARATION).any():
         return None
-    found = peaks / (command.t_s[-1] - command.t_s[0])
+    found = peaks / (even.size * command.period_s)
     for _ in range(_STEPS):
         found = found + _step(command, found)
     residual = command.values - _fitted(command, found)

@@ -44,3 +44,20 @@ def test_each_kind_is_found(kind, values):
 def test_what_never_moves_excites_nothing():
     assert find_excitation(Series("u", T, np.ones(T.size))) is None
     assert find_excitation(Series("u", T[:50], np.sin(T[:50]))) is None
+
+
+@pytest.mark.parametrize(("chip", "count"), [(10, 4.3), (7, 2.2)])
+def test_a_binary_sequence_that_repeats_is_periodic(chip, count):
+    once = np.repeat(signal.max_len_seq(6)[0] * 2.0 - 1, chip)
+    values = np.tile(once, 5)[: int(count * once.size)]
+    found = find_excitation(Series("u", np.arange(values.size) * 0.01, values))
+    assert found.kind is Kind.PERIODIC
+    assert found.period_s == pytest.approx(once.size * 0.01, rel=1e-9)
+
+
+def test_a_period_may_end_between_two_samples():
+    lines, period_s, t = np.arange(1, 60, 2), 7.8937, np.arange(0.0, 40.0, 0.02)
+    turns = 2 * np.pi * np.outer(t, lines) / period_s + 6.28 * RNG.random(lines.size)
+    found = find_excitation(Series("u", t, np.cos(turns).sum(axis=1)))
+    assert found.kind is Kind.PERIODIC
+    assert found.period_s == pytest.approx(period_s, rel=1e-6)
