@@ -111,7 +111,13 @@ def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     with driving(f"lost:1@{FAULT_AT_S}", scenario=scenario, recorded=holding) as drive:
         _, err, written = drive.ended()
     assert err.startswith("error: the bus was silent: no joint was received for ")
-    assert "nothing more was sent; the servos hold their last commands" in err
+    # On a busy machine a reply from before the fault may come after three silent ticks.
+    assert err.strip().endswith(
+        (
+            "nothing more was sent; the servos hold their last commands",
+            "then the joints were held where they were",
+        )
+    )
     gate_stage.check_hold(written, "fault: ")
 
 
