@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.fft import next_fast_len
@@ -35,12 +36,16 @@ from .nonparametric import (
     window,
 )
 
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
 LEAST_SAMPLES = 128
 REPEATED = 1e-3
 """Two periods are one if they differ by less than this share of the variance."""
 
 _LIKELY = 10 * REPEATED  # by the parabola
 _MOST_TRIED = 16
+_SEEN = 16384  # places at which the exact period is sought
 
 LEVELS = 8
 """A command with at most so many values is one of steps."""
@@ -115,6 +120,8 @@ def excited_bins(spectrum: FloatArray) -> IntArray:
 
 def _period(values: FloatArray) -> float | None:
     """Return the period in samples, where the command repeats at least twice."""
+    from scipy.interpolate import CubicSpline
+
     n = values.size
     size = next_fast_len(2 * n, real=True)
     correlation = np.fft.irfft(np.abs(np.fft.rfft(values, size)) ** 2, size)[:n]
@@ -132,8 +139,11 @@ def _period(values: FloatArray) -> float | None:
     bend = np.maximum(before - 2 * at + after, np.finfo(float).tiny)
     beside = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
     likely = np.flatnonzero(at - 0.25 * (before - after) * beside < _LIKELY)[:_MOST_TRIED]
+    if not likely.size:
+        return None
+    curve = CubicSpline(np.arange(n, dtype=np.float64), values)
     for start, known in zip((lags[least] + beside)[likely], at[likely], strict=True):
-        lag, left = _exact_lag(values, float(start))
+        lag, left = _exact_lag(curve, float(start))
         if min(known, left) < REPEATED:
             return lag if left <= known else float(np.rint(start))
     return None
@@ -146,19 +156,15 @@ def _minima(values: FloatArray, first: int) -> IntArray:
     return found[found > first]
 
 
-def _exact_lag(values: FloatArray, lag: float) -> tuple[float, float]:
+def _exact_lag(curve: CubicSpline, lag: float) -> tuple[float, float]:
     """Return the lag of least difference between two samples, and the difference there.
 
     The step of Gauss and Newton from the parabola's vertex; sum (u(t + L) - u(t))^2 over its mean
-    square.
+    square, at up to :data:`_SEEN` places spread over the command.
     """
-    from scipy.interpolate import CubicSpline
-
-    place = np.arange(values.size, dtype=np.float64)
-    curve, slope = (one := CubicSpline(place, values)), one.derivative()
-    place = place[: int(values.size - 2 - lag)]
-    now = values[: place.size]
-    rate = slope(place + lag)
+    last = curve.x[-1] - lag - 1
+    place = np.arange(0.0, last, max(1, round(last / _SEEN)))
+    now, rate = curve(place), curve(place + lag, 1)
     power = float(rate @ rate)
     step = float(rate @ (curve(place + lag) - now)) / power if power > 0 else 0.0
     lag -= min(max(step, -0.5), 0.5)
