@@ -44,8 +44,8 @@ REPEATED = 1e-3
 """Two periods are one if they differ by less than this share of the variance."""
 
 _LIKELY = 10 * REPEATED  # by the parabola
-_MOST_TRIED = 16
-_SEEN = 16384  # places at which the exact period is sought
+_MOST_TRIED = 256  # a strong line of a multisine nearly repeats many times in a period
+_SEEN = 2048  # places at which the exact period is sought
 
 LEVELS = 8
 """A command with at most so many values is one of steps."""
@@ -142,10 +142,10 @@ def _period(values: FloatArray) -> float | None:
     if not likely.size:
         return None
     curve = CubicSpline(np.arange(n, dtype=np.float64), values)
-    for start, known in zip((lags[least] + beside)[likely], at[likely], strict=True):
-        lag, left = _exact_lag(curve, float(start))
+    for whole, part, known in zip(lags[least[likely]], beside[likely], at[likely], strict=True):
+        lag, left = _exact_lag(curve, float(whole + part))
         if min(known, left) < REPEATED:
-            return lag if left <= known else float(np.rint(start))
+            return lag if left <= known else float(whole)
     return None
 
 
@@ -304,8 +304,6 @@ def _of_band(even: Sequence[FloatArray], step: float) -> LineResponse | None:
         even: Command, response and, if any, external reference, each of shape (n,).
         step: Their sampling interval [s].
     """
-    if even[0].size <= _SPARE:
-        return None
     # Without the mean; a straight line taken off would leak unlike the rest.
     u, y, *reference = (np.fft.rfft(one - one.mean()) for one in even)
     half = window(1, freedom=_FREEDOM)

@@ -64,7 +64,7 @@ def _names(topics: Topics, topic: str) -> tuple[str, ...]:
             names |= dict.fromkeys(own)
             if len(own) > 1:  # all joints in one message
                 break
-    except DataError:  # a damaged schema or message: whoever reads the topic says so
+    except DataError:  # a damaged schema or message: reported where the topic is read
         return ()
     return tuple(names)
 

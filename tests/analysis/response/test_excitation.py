@@ -61,3 +61,14 @@ def test_a_period_may_end_between_two_samples():
     found = find_excitation(Series("u", t, np.cos(turns).sum(axis=1)))
     assert found.kind is Kind.PERIODIC
     assert found.period_s == pytest.approx(period_s, rel=1e-6)
+
+
+def test_a_strong_line_is_not_taken_for_the_period():
+    """Forty cycles of it in a period, each of which nearly repeats."""
+    t, period_s = np.arange(0.0, 100.0, 0.02), 31.237
+    values = np.cos(2 * np.pi * 40 * t / period_s)
+    for line in (3, 7, 11, 16):
+        values = values + 0.04 * np.cos(2 * np.pi * line * t / period_s + line)
+    found = find_excitation(Series("u", t, values))
+    assert found.kind is Kind.PERIODIC
+    assert found.period_s == pytest.approx(period_s, rel=1e-6)

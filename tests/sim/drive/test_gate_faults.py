@@ -20,6 +20,7 @@ from support import gate_stage
 from support.gate_stage import SAFETY, Written, staged
 from support.processes import process
 
+NOTHING_MORE = "nothing more was sent; the servos hold their last commands"
 FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
 ERROR = 40  # of rcl_interfaces/msg/Log
 
@@ -111,13 +112,10 @@ def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     with driving(f"lost:1@{FAULT_AT_S}", scenario=scenario, recorded=holding) as drive:
         _, err, written = drive.ended()
     assert err.startswith("error: the bus was silent: no joint was received for ")
-    # On a busy machine a reply from before the fault may come after three silent ticks.
-    assert err.strip().endswith(
-        (
-            "nothing more was sent; the servos hold their last commands",
-            "then the joints were held where they were",
-        )
-    )
+    # On a busy machine three ticks may be silent before the fault begins, and joints come again.
+    again = any("gate: a joint was received again" in text for _, _, text in written.said)
+    how = "then the joints were held where they were" if again else NOTHING_MORE
+    assert how in err
     gate_stage.check_hold(written, "fault: ")
 
 
@@ -267,7 +265,7 @@ def test_a_second_ctrl_c_ends_it_at_once(driving):
         drive.signal(signal.SIGINT)
         _, err, written = drive.ended()
     assert "stop requested (Ctrl-C)" in err
-    assert "nothing more was sent; the servos hold their last commands" in err
+    assert NOTHING_MORE in err
     ending = written.after("gate: ending")
     assert all(len(angle) <= 60 for angle in ending.values())  # the way down takes more
     assert all(not len(angle) for angle in written.after("nothing is sent any more").values())
