@@ -19,13 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from .harmonic import cos_sin
 from .series import Series, sample_weights
+
+_Number = TypeVar("_Number", np.float64, np.complex128)
 
 _EDGE = 1e-6
 """Of a cycle: a sample at its edge but for rounding is the first of the one that begins there."""
@@ -83,7 +87,7 @@ def starts_of(t_s: FloatArray, edges_s: FloatArray) -> IntArray:
     return np.searchsorted(t_s, edges_s).astype(np.int64)
 
 
-def cycle_sums(values: FloatArray, starts: IntArray) -> FloatArray:
+def cycle_sums(values: NDArray[_Number], starts: IntArray) -> NDArray[_Number]:
     """Return the sums over the samples of each cycle.
 
     Args:
@@ -94,7 +98,7 @@ def cycle_sums(values: FloatArray, starts: IntArray) -> FloatArray:
         Shape (..., c); 0 where a cycle has no samples.
     """
     filled = np.diff(starts) > 0
-    sums = np.zeros((*values.shape[:-1], filled.size))
+    sums = np.zeros((*values.shape[:-1], filled.size), values.dtype)
     if np.any(filled):
         inner = values[..., : int(starts[-1])]
         sums[..., filled] = np.add.reduceat(inner, starts[:-1][filled], axis=-1)
@@ -118,10 +122,20 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
         Amplitudes at t = 0, shape (..., c); NaN where a cycle has too few samples.
     """
     cosine, sine = cos_sin(omega * t_s)
-    basis = np.stack([np.ones_like(cosine), cosine, -sine])
-    gram = np.stack([cycle_sums(basis * row, starts) for row in basis])
-    right = np.stack([cycle_sums(values * row, starts) for row in basis])
-    known: BoolArray = np.diff(starts) >= _LEAST_SAMPLES
+    filled = np.diff(starts)
+    along, across = (cycle_sums(one, starts) for one in (cosine, sine))
+    square, mixed = (cycle_sums(cosine * one, starts) for one in (cosine, sine))
+    gram = np.array(  # of 1, cos and -sin
+        [[filled, along, -across], [along, square, -mixed], [-across, -mixed, filled - square]]
+    )
+    right = np.stack(
+        [
+            cycle_sums(values, starts),
+            cycle_sums(values * cosine, starts),
+            -cycle_sums(values * sine, starts),
+        ]
+    )
+    known: BoolArray = filled >= _LEAST_SAMPLES
     result = np.full(right.shape[1:], np.nan, dtype=np.complex128)
     each = right[..., known].reshape(3, -1, np.count_nonzero(known))
     solved = np.linalg.solve(gram.T[known], each.transpose(2, 0, 1))

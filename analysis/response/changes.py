@@ -297,11 +297,12 @@ def _noise_within(
         amplitude: Shape (m, c).
     """
     inside = slice(int(starts[0]), int(starts[-1]))
-    cosine, sine = cos_sin(omega * t_s[inside])
+    cosine, sine = cos_sin(0.5 * omega * t_s[inside])
+    wave: ComplexArray = cosine + 1j * sine
+    turn = wave * wave
     filled = np.diff(starts)
     known: ComplexArray = np.where(np.isfinite(amplitude), amplitude, 0.0).astype(np.complex128)
-    known = np.repeat(known, filled, axis=1)
-    rest: FloatArray = values[:, inside] - (known.real * cosine - known.imag * sine)
+    rest: FloatArray = values[:, inside] - (np.repeat(known, filled, axis=1) * turn).real
     starts = starts - starts[0]
     rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled, axis=1)
     usable = filled > 0
@@ -310,9 +311,8 @@ def _noise_within(
     for beside, kept in zip(_BESIDE, _KEPT, strict=True):
         if beside * omega * period_s > 2 * np.pi * NYQUIST_SHARE:
             break
-        waves = cos_sin(beside * omega * t_s[inside])
-        one, other = (cycle_sums(wave * rest, starts) for wave in waves)
-        power: FloatArray = one**2 + other**2
+        wave = wave * turn
+        power: FloatArray = np.abs(cycle_sums(wave * rest, starts)) ** 2
         levels.append(np.mean(power[:, usable] / filled[usable], axis=1) / kept)
     if not levels:
         return np.zeros(len(values))

@@ -49,6 +49,8 @@ from ..samples.tracks import Track
 from ..samples.tracks import tables as tables_of
 from .lines import log_look, log_rows, part_entities
 
+arrow: Any = cast("Any", pa)  # without types
+
 CYCLES = "/cycles"
 
 
@@ -305,28 +307,59 @@ def _log_rows(rec: rr.RecordingStream, clock: Clock, chart: Chart, table: CycleT
     # After the last cycle there is none.
     heights = np.append(table.value[row], np.full((len(row), 1), np.nan), axis=1).T
     for rows, times in clock.rows(t_ns):
-        bars = [
-            rr.BarChart(
-                height[sure := np.isfinite(height)],
-                abscissa=left[sure],
-                widths=np.full(np.count_nonzero(sure), _CURRENT_WIDTH),
-                color=CURRENT,
-            )
-            for height in heights[rows]
+        height = heights[rows]
+        known = np.isfinite(height)
+        many = np.count_nonzero(known, axis=1)
+        one = np.ones_like(many)
+        wide = np.full(many.sum(), _CURRENT_WIDTH, np.float32)
+        look: Any = rr.BarChart([0.0], color=CURRENT).color
+        columns = [
+            _column(rr.BarChart.descriptor_values(), _tensors(height[known], many), one),
+            _column(
+                rr.BarChart.descriptor_abscissa(),
+                _tensors(np.broadcast_to(left, height.shape)[known], many),
+                one,
+            ),
+            _column(rr.BarChart.descriptor_widths(), arrow.array(wide), many),
+            _column(
+                rr.BarChart.descriptor_color(),
+                arrow.array(np.repeat(look.as_arrow_array().to_numpy(), many.size)),
+                one,
+            ),
         ]
-        rec.send_columns(f"{SEGMENTS}/{chart.key}/current", times, _columns(bars))
+        rec.send_columns(f"{SEGMENTS}/{chart.key}/current", times, columns)
 
 
-def _columns(bars: Sequence[rr.BarChart]) -> list[rr.ComponentColumn]:
-    """Bar charts as rows: Rerun has no columns of tensors that differ in length."""
-    parts = [chart.as_component_batches() for chart in bars]
-    columns: list[rr.ComponentColumn] = []
-    for same in zip(*parts, strict=True):
-        arrays = [batch.as_arrow_array() for batch in same]
-        rows = _Arrow(cast("Any", pa).concat_arrays(arrays))
-        lengths = [len(array) for array in arrays]
-        columns.append(rr.ComponentColumn(same[0].component_descriptor(), rows, lengths=lengths))
-    return columns
+def _column(kind: rr.ComponentDescriptor, values: Any, lengths: IntArray) -> rr.ComponentColumn:
+    return rr.ComponentColumn(kind, _Arrow(values), lengths=lengths.tolist())
+
+
+def _tensors(numbers: FloatArray, lengths: IntArray) -> Any:
+    """Vectors as Rerun's tensors: it makes one at a time, in a millisecond.
+
+    Args:
+        numbers: Of all vectors, one after the other.
+        lengths: Of each vector, shape (n,).
+
+    Returns:
+        Arrow array of n structures.
+    """
+    one: Any = rr.BarChart([0.0]).values
+    shape, names, buffer = one.as_arrow_array().type
+    fields: list[Any] = list(buffer.type)
+    number = [field.name for field in fields].index("F64")
+    each = np.arange(lengths.size + 1, dtype=np.int32)
+    ends = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
+    children = [arrow.nulls(0, field.type) for field in fields]
+    children[number] = arrow.ListArray.from_arrays(ends, numbers, type=fields[number].type)
+    codes = np.full(lengths.size, number, dtype=np.int8)
+    offsets = [None, arrow.py_buffer(codes), arrow.py_buffer(each[:-1])]
+    parts = [
+        arrow.ListArray.from_arrays(each, lengths.astype(np.uint64), type=shape.type),
+        arrow.nulls(lengths.size, names.type),
+        arrow.Array.from_buffers(buffer.type, lengths.size, offsets, children=children),
+    ]
+    return arrow.StructArray.from_arrays(parts, fields=[shape, names, buffer])
 
 
 class _Arrow:

@@ -20,6 +20,9 @@ _STEPS = 16
 """Steps in which pages of a large column are requested; page faults cost twice as much."""
 _STEP_SIZE = 1 << 18
 """Fewest bytes of a column that are requested at once: a call costs as much as some pages."""
+_CACHED = 512
+"""Rows that are copied at once: a core's cache holds those of a message of 1 kB, and each column
+reads them anew."""
 _POPULATE_WRITE = 23
 """Linux's MADV_POPULATE_WRITE (5.14), which Python has no name for."""
 
@@ -68,7 +71,10 @@ class ColumnStore:
         if rows.ndim == 1:
             self._part(self._count, stop)[:, 0] = rows
         else:
-            self._part(self._count, stop)[...] = rows
+            step = len(rows) if self._by_row else _CACHED
+            for first in range(0, len(rows), step):
+                some = rows[first : first + step]
+                self._part(self._count + first, self._count + first + len(some))[...] = some
         self._count = stop
 
     def values(self) -> NDArray[Any]:

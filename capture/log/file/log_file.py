@@ -47,7 +47,9 @@ def new_pages(size: int) -> mmap.mmap:
         MemoryError: If there is not enough memory.
     """
     try:
-        return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        memory.madvise(mmap.MADV_HUGEPAGE)
+        return memory
     except OSError as error:
         raise MemoryError(f"{size} bytes for what is read") from error
 
