@@ -240,7 +240,7 @@ def _cycles(
         starts = starts_of(t_s, edges - 1e-6 * turn_s)
         found = amplitudes(t_s, rest, starts, fit.omega)
         whole[block] = _without_image(1 + found / amplitude, amplitude, edges, fit.omega)
-        noise[block] = _noise_within(t_s, rest, starts, fit.omega, found)
+        noise[block] = _noise_within(every[block[0]], rest, starts, fit.omega, found)
     noise /= np.abs(fit.amplitudes[at, 0]) ** 2
     whole = whole.reshape(2, len(commands), count)
     usable: BoolArray = np.all(np.isfinite(whole), axis=(0, 1)).reshape(count)
@@ -282,7 +282,7 @@ def _without_image(
 
 
 def _noise_within(
-    t_s: FloatArray, values: FloatArray, starts: IntArray, omega: float, amplitude: ComplexArray
+    sampled: Series, values: FloatArray, starts: IntArray, omega: float, amplitude: ComplexArray
 ) -> FloatArray:
     """Return the variance that noise gives each part of a cycle's amplitude, shape (m,).
 
@@ -291,13 +291,13 @@ def _noise_within(
     power of the frequency, if it rises towards it; what the fit takes of it there is added.
 
     Args:
-        t_s: Shape (n,).
+        sampled: A channel with their n times.
         values: Shape (m, n).
         starts: Shape (c + 1,).
         amplitude: Shape (m, c).
     """
     inside = slice(int(starts[0]), int(starts[-1]))
-    cosine, sine = cos_sin(0.5 * omega * t_s[inside])
+    cosine, sine = cos_sin(0.5 * omega * sampled.t_s[inside])
     wave: ComplexArray = cosine + 1j * sine
     turn = wave * wave
     filled = np.diff(starts)
@@ -306,10 +306,9 @@ def _noise_within(
     starts = starts - starts[0]
     rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled, axis=1)
     usable = filled > 0
-    period_s = float(np.median(np.diff(t_s)))
     levels: list[FloatArray] = []
     for beside, kept in zip(_BESIDE, _KEPT, strict=True):
-        if beside * omega * period_s > 2 * np.pi * NYQUIST_SHARE:
+        if beside * omega * sampled.period_s > 2 * np.pi * NYQUIST_SHARE:
             break
         wave = wave * turn
         power: FloatArray = np.abs(cycle_sums(wave * rest, starts)) ** 2
