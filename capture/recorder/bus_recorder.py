@@ -94,8 +94,8 @@ def decoded_source(
 _FRAMES_PER_MESSAGE = 4096
 _FRAMES_PER_SLICE = 1024
 _FEWEST = 256  # with fewer, each frame costs more
-_LONG_NS = 8_000_000  # processor time of a slice: half as many frames next time
-_SHORT_NS = 3_000_000  # twice as many
+_LONG_NS = 12_000_000  # processor time of a slice: half as many frames next time
+_SHORT_NS = 6_000_000  # twice as many
 _PIECES = 8
 _MOST_FAILURES = 16  # single frames in a row; then the rest of the slice is not tried
 

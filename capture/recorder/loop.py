@@ -1,4 +1,4 @@
-"""The recorder's loop: one thread, a tick every 10 ms, and nothing in it that waits.
+"""The recorder's loop: one thread, a tick every 20 ms, and nothing in it that waits.
 
 Each tick takes the new frames of every source and writes them raw; decoding follows in slices.
 Tasks of once a second are spread over the second's ticks, so that no tick is long.
@@ -27,13 +27,13 @@ from .bus_recorder import BusRecorder
 from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
 
-TICK_NS = 10_000_000
+TICK_NS = 20_000_000
 """Interval of polling the sources and writing their raw frames [ns]."""
 
-DECODE_TICKS = 10
+DECODE_TICKS = 5
 """Ticks between two rounds of decoding; a backlog is decoded in the next tick."""
 
-WATCHED_TICKS = 4
+WATCHED_TICKS = 2
 """The same with a live view."""
 
 _PRESSED = 1000
