@@ -3,11 +3,13 @@
 import contextlib
 import ctypes
 import ctypes.util
+import gc
 import json
 import os
 import shutil
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -29,26 +31,29 @@ PR_SET_CHILD_SUBREAPER = 36
 ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
-def _children():
-    """Return the running processes whose parent this one is, but for trackers of multiprocessing.
+def _children(since_s):
+    """Return running children of this process, but for trackers of multiprocessing.
 
-    A tracker is ended by multiprocessing itself.
+    Only those that began at a time since boot or later; a tracker is ended by multiprocessing
+    itself.
     """
+    first = int(since_s * os.sysconf("SC_CLK_TCK"))
     found = set()
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             with contextlib.suppress(OSError):
-                state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
+                facts = (folder / "stat").read_text().rpartition(")")[2].split()
+                state, parent, began = facts[0], int(facts[1]), int(facts[19])
                 is_tracker = b"tracker" in (folder / "cmdline").read_bytes()
-                if int(parent) == os.getpid() and state != "Z" and not is_tracker:
+                if parent == os.getpid() and state != "Z" and began >= first and not is_tracker:
                     found.add(int(folder.name))
     return found
 
 
-def _end_children(but=frozenset()):
+def _end_children(since_s=0.0):
     """Kill running children; those of a killed one become children of this process."""
     for _ in range(10):
-        found = _children() - but
+        found = _children(since_s)
         for pid in found:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
@@ -60,12 +65,37 @@ def _end_children(but=frozenset()):
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call():
     """End the processes that a test started before it failed or was interrupted."""
-    before = _children()
+    began_s = time.clock_gettime(time.CLOCK_BOOTTIME)
     try:
         return (yield)
     except BaseException:
-        _end_children(before)
+        _end_children(began_s)
         raise
+
+
+LONG_S = 0.2
+"""A test that records takes longer; to count exempt objects takes milliseconds."""
+_began_s = 0.0
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish():
+    """Exempt what was imported from garbage collection: a full one takes a quarter of a second."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_runtest_logstart():
+    """Note when a test begins."""
+    global _began_s  # noqa: PLW0603
+    _began_s = time.monotonic()
+
+
+def pytest_runtest_logfinish():
+    """Exempt it again after a recording, whose end makes all objects subject to collection."""
+    if time.monotonic() - _began_s > LONG_S and not gc.get_freeze_count():
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.hookimpl(trylast=True)

@@ -2,12 +2,10 @@
 
 import re
 import shlex
-import sys
 
 import pytest
 
 from support.paths import DOCS, SHARED
-from support.processes import run
 
 PAGE = (DOCS / "how-to/other-robots.md").read_text()
 BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
@@ -23,16 +21,16 @@ def test_the_page_names_no_other_folder_than_data():
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n")[0].split("/")[-1])
-def test_each_block_of_the_page_is_what_is_printed(block, tmp_path):
+def test_each_block_of_the_page_is_what_is_printed(block, tmp_path, monkeypatch, command):
     if not SHARED.is_dir():
         pytest.skip(f"the real recordings {SHARED.name} are not beside this checkout")
     (tmp_path / "DATA").symlink_to(SHARED)
-    for command, *shown in (part.split("\n") for part in block.removeprefix("$ ").split("\n$ ")):
-        program, *words = shlex.split(command)
+    monkeypatch.chdir(tmp_path)
+    for line, *shown in (part.split("\n") for part in block.removeprefix("$ ").split("\n$ ")):
+        program, *words = shlex.split(line)
         assert program == "undulog"
-        done = run(sys.executable, "-m", "undulog", *words, cwd=tmp_path, code=0)
         expected = [line for line in shown if line]
-        printed = [line.rstrip() for line in done.stdout.splitlines() if line.strip()]
+        printed = [line.rstrip() for line in command(*words).out.splitlines() if line.strip()]
         if expected[-1] == "...":
             expected.pop()
             assert len(printed) > len(expected)

@@ -7,8 +7,9 @@ import shlex
 import pytest
 
 import undulog
+from support.linear_chain import CHAIN, WAVE, M, write_run
+from undulog.capture import load_robot
 from undulog.sim import load_scenario
-from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
 
 # What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
@@ -114,9 +115,9 @@ OF_ONE = [
 @pytest.fixture(scope="module")
 def of_one(tmp_path_factory):
     """A folder with one session."""
-    folder = tmp_path_factory.mktemp("one")
-    scenario = load_scenario("flat").changed(duration_s=12.0)
-    record(scenario, folder / "run.mcap", kernels=Kernels.NUMBA)
+    folder, robot = tmp_path_factory.mktemp("one"), load_robot("snake25")
+    some = {"names": robot.joint_names[: 2 * M : 2], "robot": robot}
+    write_run(folder / "run.mcap", WAVE, CHAIN @ WAVE, 1, 0.003, **some)
     return folder
 
 

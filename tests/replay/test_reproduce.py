@@ -17,7 +17,7 @@ def room(tmp_path_factory):
     """A run of a robot whose file is gone by the time that it is run again."""
     folder = tmp_path_factory.mktemp("again")
     (folder / "chain.toml").write_text(chain(5, planes=["horizontal"]))
-    run = {"duration_s": 5.0, "settle_s": 1.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
+    run = {"duration_s": 3.5, "settle_s": 1.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
     world = wave(**run, horizontal={"lag": 1.0}, noise={"position": 0.001})
     (folder / "wave.toml").write_text(world)
     assert front.run(["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]) == 0
@@ -39,7 +39,7 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     assert path.read_text() == "mine"
     again(room, path, "--force")
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
+    assert printed[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 3.5 s")
     assert printed[1].startswith("The same to the last bit: all ")
     both = f"{room / 'run.mcap'} {path}"
     assert printed[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]

@@ -15,16 +15,17 @@ MODULE[1] = 0.97 * np.exp(-0.02j)
 """j2 is weak."""
 
 
-def write_run(path, command, answer, seed, sigma):
-    """Write six cycles at 50 Hz."""
+def write_run(path, command, answer, seed, sigma, *, names=NAMES, **options):
+    """Write six cycles at 50 Hz; options are those of :func:`.write_joints`."""
     noise = np.random.default_rng(seed).normal(0.0, sigma, (300, M))
     turn = turns(1.0, 300)
     return write_joints(
         path,
-        NAMES,
+        names,
         np.real(command * turn),
         [np.real(answer * turn) + noise],
         epoch_ns=EPOCH_NS + seed * 10_000_000_000,
+        **options,
     )
 
 

@@ -20,7 +20,6 @@ from support.analysed import analysed as analysed_session
 from support.bucket import s3_bucket
 from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
-from support.processes import undulog
 from support.ros_bags import BY_FILE, BY_MESSAGE, Filler, filling, ticks, write_bag
 from support.written_sessions import joint_state, write_foreign, write_session
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
@@ -313,11 +312,12 @@ def test_a_bag_alone_and_damaged_ones(bags, opened):
     assert all("reindex" in reason for reason in reasons)
 
 
-def test_mutated_bags_are_rows_or_damaged_ones(bags):
+@pytest.mark.parametrize("rounds", [4, pytest.param(15, marks=pytest.mark.slow)])
+def test_mutated_bags_are_rows_or_damaged_ones(rounds, bags):
     draw = np.random.default_rng(4)
     paths = [path for path in bags.rglob("*") if path.is_file() and "tool" not in path.parts]
     whole = {path: path.read_bytes() for path in paths}
-    for _ in range(15):
+    for _ in range(rounds):
         for path, content in whole.items():
             data = bytearray(content)
             for at in draw.integers(len(data), size=8):
@@ -471,19 +471,19 @@ def test_wrong_places_and_conditions_are_refused(lab):
         catalog.sql("selct 1")
 
 
-def test_the_command(lab):
-    found = json.loads(undulog("catalog", lab, "--where", "status = 'analysed'", "--json").stdout)
+def test_the_command(lab, command, report_of):
+    found = report_of("catalog", lab, "--where", "status = 'analysed'")
     assert [row["path"] for row in found["rows"]] == ["day1/gait.mcap"]
     assert found["scan"]["read"] == 4
-    text = undulog("catalog", lab).stdout
+    text = command("catalog", lab).out
     assert "plain.mcap" in text
     assert "2 rows; 2 sessions, 0 files read now" in text
-    undulog("catalog", lab, "--joints", "-o", lab / "joints.csv", code=0)
+    command("catalog", lab, "--joints", "-o", lab / "joints.csv")
     assert len(pd.read_csv(lab / "joints.csv")) > 1
     query = "select robot, count(*) as n from catalog group by robot"
-    assert undulog("catalog", lab, "--sql", query).returncode == 0
-    assert undulog("catalog", lab, "--sql", query, "--joints").returncode == 2
-    assert undulog("catalog", lab / "none").returncode == 1
+    command("catalog", lab, "--sql", query)
+    command("catalog", lab, "--sql", query, "--joints", code=2)
+    command("catalog", lab / "none", code=1)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from support.linear_chain import CHAIN, WAVE, M, write_run
-from support.processes import undulog
 from undulog.analysis.catalog.change_points import find_change_points, relative_to_others
 from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
@@ -78,7 +77,15 @@ def frames(seed, kind="none", *, size=0.05, n=60, joints=13, gaits=1):
     return sessions, rows, names[worn], FIRST + pd.Timedelta(days=begun)
 
 
-def test_a_worn_joint_is_named_with_its_date():
+@pytest.fixture
+def without_models(monkeypatch):
+    """Leave out the mixed-effects models, which take most of the time."""
+    monkeypatch.setattr(
+        "undulog.analysis.catalog.fleet._components", lambda name, *_: Components(name)
+    )
+
+
+def test_a_worn_joint_is_named_with_its_date(without_models):
     sessions, rows, name, begun = frames(3, "step")
     fleet = analyse_fleet(sessions, rows)
     (change,) = fleet.robots[0].changes
@@ -89,7 +96,7 @@ def test_a_worn_joint_is_named_with_its_date():
     assert begun.date().isoformat() in fleet.answer
 
 
-def test_variance_components_and_trends_are_those_planted():
+def test_variance_components_are_those_planted():
     sessions, rows, _, _ = frames(8)
     (robot,) = analyse_fleet(sessions, rows).robots
     by_name = {one.quantity: one for one in robot.components}
@@ -97,6 +104,10 @@ def test_variance_components_and_trends_are_those_planted():
     assert by_name["lag"].session == pytest.approx(0.02, rel=0.3)
     assert by_name["energy"].joint == pytest.approx(0.2, rel=0.6)
     assert robot.changes == ()
+
+
+def test_a_trend_is_that_planted(without_models):
+    sessions, rows, _, _ = frames(8)
     days = (sessions.start - FIRST) / pd.Timedelta(days=1)
     drifting = sessions.assign(lag_sd=0.01 + 0.001 * days)
     trends = {one.quantity: one for one in analyse_fleet(drifting, rows).robots[0].trends}
@@ -107,7 +118,7 @@ def test_variance_components_and_trends_are_those_planted():
     assert low - 1e-9 <= 0.001 <= high + 1e-9
 
 
-def test_results_of_a_sweep_are_held_against_its_parameters():
+def test_results_of_a_sweep_are_held_against_its_parameters(without_models):
     sessions, rows, _, _ = frames(3)
     torque = np.random.default_rng(0).permutation(np.geomspace(0.2, 1.0, len(sessions)))
     swept = sessions.assign(
@@ -126,7 +137,7 @@ def test_results_of_a_sweep_are_held_against_its_parameters():
     assert trends["lag_sd", "date"].p > 0.05
 
 
-def test_an_odd_session_is_an_outlier_and_no_change():
+def test_an_odd_session_is_an_outlier_and_no_change(without_models):
     sessions, rows, _, _ = frames(5)
     at = (rows.path == "run030.mcap") & (rows.joint == "joint04")
     rows.loc[at, "lag_rad"] += 0.2
@@ -137,7 +148,7 @@ def test_an_odd_session_is_an_outlier_and_no_change():
     assert first.deviation == pytest.approx(0.2, abs=0.04)
 
 
-def test_few_or_incomplete_sessions_are_reported():
+def test_few_or_incomplete_sessions_are_reported(without_models):
     sessions, rows, _, _ = frames(1, n=40)
     few = analyse_fleet(sessions.head(5), rows)
     assert few.robots == ()
@@ -168,14 +179,6 @@ def test_one_joint_does_not_move_the_others():
     assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
 
 
-@pytest.fixture
-def without_models(monkeypatch):
-    """Leave out the mixed-effects models, which take most of the time."""
-    monkeypatch.setattr(
-        "undulog.analysis.catalog.fleet._components", lambda name, *_: Components(name)
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("gaits", [1, 3])
 def test_without_wear_hardly_a_joint_is_named(without_models, gaits):
@@ -198,7 +201,7 @@ def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
     assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]
 
 
-def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
+def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path, command, report_of):
     for number in range(12):
         weak = np.diag(np.where(np.arange(M) == 2, 0.8 if number >= 6 else 1.0, 1.0))
         answer = weak @ CHAIN @ WAVE
@@ -207,8 +210,7 @@ def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
         write_run(tmp_path / f"run{number:02d}.mcap", WAVE, answer, number, 0.003)
     (tmp_path / "run03.html").write_text("its page")
     page = tmp_path / "fleet.html"
-    done = undulog("report", "--catalog", tmp_path, "-o", page, "--json", code=0)
-    result = json.loads(done.stdout)
+    result = report_of("report", "--catalog", tmp_path, "-o", page)
     assert "the gain of j3 falls by" in result["answer"]
     text = page.read_text()
     for part in (
@@ -220,4 +222,4 @@ def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
         assert part in text
     assert "://" not in text.replace("http://www.w3.org", "")
     words = ("--catalog", tmp_path, "-o", page, "--force")
-    assert undulog("report", tmp_path / "run00.mcap", *words).returncode == 2
+    command("report", tmp_path / "run00.mcap", *words, code=2)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from support.linear_chain import CHAIN, WAVE, write_run
 from support.paths import ROOT
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
@@ -41,6 +42,12 @@ def script(folder, text):
     path.write_text(f"#!/bin/bash\n{text}\n")
     path.chmod(0o755)
     return path
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A session that is analysed soon."""
+    return write_run(tmp_path_factory.mktemp("short") / "run.mcap", WAVE, CHAIN @ WAVE, 1, 0.003)
 
 
 def test_a_session_on_paper(chromium, tmp_path, command):
@@ -97,11 +104,11 @@ def test_without_a_browser_the_message_says_what_to_do(tmp_path, monkeypatch, co
         ("exit 0", "wrote no PDF"),
     ],
 )
-def test_a_browser_that_fails_leaves_nothing(text, expected, tmp_path, command):
+def test_a_browser_that_fails_leaves_nothing(text, expected, short, tmp_path, command):
     out = tmp_path / "out"
     out.mkdir()
     failing = script(tmp_path, text)
-    said = command("report", GOLDEN, "--pdf", out / "x.pdf", "--browser", failing, code=1).err
+    said = command("report", short, "--pdf", out / "x.pdf", "--browser", failing, code=1).err
     assert expected in said
     assert list(out.iterdir()) == []
 
@@ -119,12 +126,12 @@ def test_a_browser_that_hangs_is_ended_with_its_children(tmp_path):
     assert processes_of(tmp_path) == []
 
 
-def test_ctrl_c_ends_the_browser(tmp_path):
+def test_ctrl_c_ends_the_browser(short, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     started = tmp_path / "started"
     hanging = script(tmp_path, f"touch {started}; bash -c 'sleep 600; # {tmp_path}' & wait")
-    words = [UNDULOG, "report", GOLDEN, "--pdf", out / "x.pdf", "--browser", hanging]
+    words = [UNDULOG, "report", short, "--pdf", out / "x.pdf", "--browser", hanging]
     running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     while not started.exists() and running.poll() is None:
         time.sleep(0.05)

@@ -7,18 +7,18 @@ from itertools import pairwise
 
 import pytest
 
-from support.paths import ROOT
-
-GOLDEN = ROOT / "tests/replay/golden/session.mcap"
+from support.linear_chain import CHAIN, WAVE, M, write_run
+from undulog.capture import load_robot
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A session, the same in a folder, and a file that is none."""
-    place = tmp_path_factory.mktemp("several")
+    """A session of some joints, the same in a folder, and a file that is none."""
+    place, robot = tmp_path_factory.mktemp("several"), load_robot("snake25")
     (place / "sub").mkdir()
-    shutil.copy(GOLDEN, place / "a.mcap")
-    shutil.copy(GOLDEN, place / "sub/a.mcap")
+    some = {"names": robot.joint_names[: 2 * M : 2], "robot": robot}
+    write_run(place / "a.mcap", WAVE, CHAIN @ WAVE, 1, 0.003, **some)
+    shutil.copy(place / "a.mcap", place / "sub/a.mcap")
     (place / "bad.mcap").write_text("junk")
     return place
 

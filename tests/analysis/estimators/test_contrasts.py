@@ -19,7 +19,7 @@ def judged(*case, **more):
 
 
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])
-@pytest.mark.parametrize("correlation", [0.0, 0.9])
+@pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9])
 def test_contrasts_cover_whatever_joints_share(shared, correlation):
     """300 runs of nine joints: the standard error of one contrast's coverage is 1.3 %."""
     covered = judged(shared, correlation)

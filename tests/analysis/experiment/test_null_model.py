@@ -100,7 +100,9 @@ def test_a_shift_of_the_shared_parameters_is_absorbed(curvature, dof):
     assert 0.915 < held / 400 < 0.98
 
 
-@pytest.mark.parametrize("module", [0, 2, 3, 6])
+@pytest.mark.parametrize(
+    "module", [0, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 6))]
+)
 def test_a_weak_module_is_found_and_named(module):
     """Also the middle one, to which a reversal is blind."""
     model = planted()

@@ -96,12 +96,13 @@ def rates_of(H, c):
     return EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
 
 
-def test_intervals_of_rates_hold_under_scatter():
+@pytest.mark.parametrize("draws", [8, pytest.param(20, marks=pytest.mark.slow)])
+def test_intervals_of_rates_hold_under_scatter(draws):
     J = rates_of(*kick_tables.chain(5)) / EPS
     truth = EPS * np.sort(np.linalg.eigvals(of_deviations(np.eye(5) + J)).real)
     random = np.random.default_rng(3)
     inside = []
-    for _ in range(20):
+    for _ in range(draws):
         ends = [one.rate.ci95 for one in closed_loop(measured(random, 0.1)[2], EPS).modes]
         # Of the sums: rates that lie close together change places.
         inside += [low <= t <= high for (low, high), t in zip(ends, truth, strict=True)]

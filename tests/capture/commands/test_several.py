@@ -5,6 +5,7 @@ import shutil
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
+from support.linear_chain import CHAIN, WAVE, write_run
 from support.paths import ROOT
 from support.ros_bags import BY_MESSAGE, filling, write_bag, write_split
 from undulog.capture.commands.sessions import first_sentence, sessions_of
@@ -66,7 +67,7 @@ def bags(tmp_path):
     write_bag(c, joints(), storage=StoragePlugin.MCAP, compression=BY_MESSAGE)
     shutil.copy(b / "b.db3", d)
     shutil.copytree(c, tmp_path / "alone/f")
-    shutil.copy(GOLDEN, tmp_path / "day/g.mcap")
+    write_run(tmp_path / "day/g.mcap", WAVE, CHAIN @ WAVE, 1, 0.003)
     return tmp_path
 
 

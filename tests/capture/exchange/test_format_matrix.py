@@ -26,6 +26,7 @@ from undulog.capture.log.messages import frames as fr
 T0 = 1_700_000_003_250_000_000
 S = 1_000_000_000
 BUSES = ("can0", "can1")
+ROBOT = load_robot("snake13")
 
 
 @dataclass(frozen=True, order=True)
@@ -70,9 +71,13 @@ EVERY_KIND = in_order(
     for k, (bus, kind, extended, dlc, sent) in enumerate(KINDS)
     for size in [0 if kind == "remote" else dlc]
 )
-many = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], database=None
-)
+COUNTS = [20, pytest.param(60, marks=pytest.mark.slow)]
+
+
+def each_trace(check, count):
+    """Check so many drawn traces, and the one that has every kind of frame."""
+    how = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "database": None}
+    settings(max_examples=count, **how)(example(EVERY_KIND)(given(traces)(check)))()
 
 
 def record_of(frames):
@@ -113,7 +118,7 @@ def frames_in(path):
 
 
 def imported(trace, folder):
-    report = import_can(trace, folder / "back.mcap", load_robot("snake13"), force=True)
+    report = import_can(trace, folder / "back.mcap", ROBOT, force=True)
     return frames_in(folder / "back.mcap"), report
 
 
@@ -195,11 +200,7 @@ def losses(frames, held, *, sub_us):
     )
 
 
-@pytest.mark.parametrize("suffix", EXPORTED)
-@given(frames=traces)
-@example(frames=EVERY_KIND)
-@many
-def test_export_and_import(suffix, frames):
+def exported_and_imported(suffix, frames):
     held, error_ns = EXPORTED[suffix]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -213,6 +214,12 @@ def test_export_and_import(suffix, frames):
     # ASC has its date as local time, and an import leaves it alone: its times count from 2000.
     shift = frames[0].t_ns // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
     assert abs(time_errors(back, expected, shift)).max() <= error_ns
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("suffix", EXPORTED)
+def test_export_and_import(suffix, count):
+    each_trace(lambda frames: exported_and_imported(suffix, frames), count)
 
 
 # -- python-can's writers -> import --------------------------------------------------------
@@ -263,11 +270,7 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("suffix", WRITTEN)
-@given(frames=traces)
-@example(frames=EVERY_KIND)
-@many
-def test_python_cans_writer_and_import(suffix, frames):
+def written_and_imported(suffix, frames):
     if suffix == ".mf4":
         pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     held, error_ns = WRITTEN[suffix]
@@ -297,6 +300,12 @@ def test_python_cans_writer_and_import(suffix, frames):
         assert suffix == ".trc" or first == RELATIVE_EPOCH_NS
         late -= first - kept[0].t_ns
     assert abs(late).max() <= error_ns
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_python_cans_writer_and_import(suffix, count):
+    each_trace(lambda frames: written_and_imported(suffix, frames), count)
 
 
 def test_lines_that_a_reader_passes_over_are_counted(tmp_path):

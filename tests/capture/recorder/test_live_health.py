@@ -309,7 +309,7 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(seconds, dat
 
 
 def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
-    """What is kept is counted after 30 and after 180 minutes of a slow recording."""
+    """What is kept is counted after 10 and after 60 minutes of a slow recording."""
 
     def kept():
         gc.collect()
@@ -330,7 +330,7 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
         states = writer.joint_state("/joint_states", NAMES, unit="rad")
         bus, said, diagnostics = writer.frames("/can/can0"), writer.log(), writer.diagnostics()
         frames = empty_frames(1)
-        for second in range(10_800):
+        for second in range(3600):
             t_ns = EPOCH_NS + second * NS
             commands.write(t_ns, np.full(25, 0.1 * (second % 2)))
             states.write(t_ns, np.full(25, 0.1))
@@ -342,9 +342,9 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
                 diagnostics.write(t_ns, [DiagnosticStatus(OK, "source c", "", "", values)])
             if second % 10 == 9:
                 health.update(t_ns)
-            if second in (1799, 10_799):
+            if second in (599, 3599):
                 sizes.append(kept())
-    assert sizes[1] < sizes[0] + 65_536
+    assert sizes[1] < sizes[0] + 21_845
 
 
 def test_the_verdict_meanwhile_is_that_of_a_good_recording(tmp_path):

@@ -7,6 +7,7 @@ import signal
 import pandas as pd
 import pytest
 
+import undulog as front
 from support.processes import UNDULOG, alive, process, run, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.analysis.session.analyse import analyse_session
@@ -41,13 +42,13 @@ def reference(tmp_path_factory):
     return folder
 
 
-def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path):
+def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path, command, report_of):
     frame = pd.read_parquet(reference / "rows" / "rows")
     row = frame[(frame["servo.stall_torque"] == 0.2) & (frame.seed == 1)].iloc[0]
     path = tmp_path / "run.mcap"
     words = ("--set", "servo.stall_torque=0.2", "--seed", "1", "-o", path)
-    assert undulog("sim", "run", reference / "wave.toml", *words).returncode == 0
-    result = json.loads(undulog("analyse", path, "--json").stdout)
+    command("sim", "run", reference / "wave.toml", *words)
+    result = report_of("analyse", path)
     assert row.sentence == result["answer"]["sentence"]
     assert list(row.joint) == [joint["name"] for joint in result["joints"]]
     assert list(row.gain) == [joint["gain"] for joint in result["joints"]]
@@ -72,13 +73,13 @@ def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
     assert len(list((tmp_path / "rows" / "sessions").glob("*.mcap"))) == 10
 
 
-def test_a_dry_run_runs_nothing(reference, tmp_path):
+def test_a_dry_run_runs_nothing(reference, tmp_path, command, report_of):
     plan = reference / "plan.toml"
-    done = undulog("sweep", plan, "-o", tmp_path / "rows", "--dry-run")
-    assert "10 runs of 2 s: 5 points of a grid design, 2 seeds each" in done.stdout
-    assert "to run: 10" in done.stdout
+    printed = command("sweep", plan, "-o", tmp_path / "rows", "--dry-run").out
+    assert "10 runs of 2 s: 5 points of a grid design, 2 seeds each" in printed
+    assert "to run: 10" in printed
     assert not (tmp_path / "rows").exists()
-    there, _ = swept(plan, reference / "rows", "--dry-run")
+    there = report_of("sweep", plan, "-o", reference / "rows", "--dry-run")
     assert (there["to_run"], there["estimated_s"]) == (0, 0)
 
 
@@ -122,12 +123,11 @@ def test_parameters_of_robot_and_analysis(tmp_path):
         (('"wave.toml"', '"wvae"'), "wvae"),
     ],
 )
-def test_a_key_that_is_none_is_refused_before_anything_runs(change, message, tmp_path):
+def test_a_key_that_is_none_is_refused_before_anything_runs(change, message, tmp_path, capsys):
     plan = write_plan(tmp_path)
     plan.write_text(plan.read_text().replace(*change))
-    done = undulog("sweep", plan, "-o", tmp_path / "rows")
-    assert done.returncode in (1, 2)
-    assert message in done.stderr
+    assert front.run(["sweep", str(plan), "-o", str(tmp_path / "rows")]) in (1, 2)
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "rows").exists()
 
 

@@ -13,6 +13,8 @@ import subprocess
 import sys
 import threading
 
+import pytest
+
 from support import mutation_child
 from support.processes import start
 
@@ -71,9 +73,12 @@ def read_mutated(first, stop):
     return came
 
 
-def test_a_few_hundred_mutated_files():
-    came = read_mutated(0, 300)
+@pytest.mark.parametrize(
+    ("first", "count"), [(0, 90), pytest.param(90, 210, marks=pytest.mark.slow)]
+)
+def test_a_few_hundred_mutated_files(first, count):
+    came = read_mutated(first, first + count)
     # Neither is everything refused nor does damage pass unseen.
-    assert came["read"] > 100
-    assert came["refused:"] > 20
-    assert came["recovered"] > 10
+    assert came["read"] > count / 3
+    assert came["refused:"] > count / 15
+    assert came["recovered"] > count / 30
