@@ -16,13 +16,10 @@ from ..file.log_file import FilePages, new_pages
 
 _SHORT_NS = 2**31
 _LARGE = 4 << 20
-STEPS = 16
+_STEPS = 16
 """Steps in which pages of a large column are requested; page faults cost twice as much."""
 _STEP_SIZE = 1 << 18
 """Fewest bytes of a column that are requested at once: a call costs as much as some pages."""
-_CACHED = 512
-"""Rows that are copied at once: a core's cache holds those of a message of 1 kB, and each column
-reads them anew."""
 _POPULATE_WRITE = 23
 """Linux's MADV_POPULATE_WRITE (5.14), which Python has no name for."""
 
@@ -31,13 +28,7 @@ class ColumnStore:
     """Rows of numbers, stored column by column; single bytes (text, records) row by row."""
 
     def __init__(
-        self,
-        dtype: str,
-        width: int,
-        capacity: int,
-        pages: FilePages | None = None,
-        *,
-        huge: int = 0,
+        self, dtype: str, width: int, capacity: int, pages: FilePages | None = None
     ) -> None:
         """Reserve memory, which is used only as rows are added.
 
@@ -45,10 +36,8 @@ class ColumnStore:
             dtype: numpy type string of a number.
             capacity: Expected number of rows; more cost a copy.
             pages: Storage of a large column in a file; None for memory.
-            huge: Most memory of all columns that is taken in huge pages [byte]: wrong expectations
-                would use it up by a few rows.
         """
-        self._pages, self._huge = pages, huge
+        self._pages = pages
         self._dtype = np.dtype(dtype)
         self._by_row = self._dtype.itemsize == 1
         self._width = width
@@ -79,10 +68,7 @@ class ColumnStore:
         if rows.ndim == 1:
             self._part(self._count, stop)[:, 0] = rows
         else:
-            step = len(rows) if self._by_row else _CACHED
-            for first in range(0, len(rows), step):
-                some = rows[first : first + step]
-                self._part(self._count + first, self._count + first + len(some))[...] = some
+            self._part(self._count, stop)[...] = rows
         self._count = stop
 
     def values(self) -> NDArray[Any]:
@@ -99,11 +85,7 @@ class ColumnStore:
         self._memory, self._ready = None, 0
         if size < _LARGE:
             return np.empty(shape, dtype=self._dtype)
-        memory = (
-            new_pages(size, huge=size <= self._huge)
-            if self._pages is None
-            else self._pages.new(size)
-        )
+        memory = new_pages(size) if self._pages is None else self._pages.new(size)
         if sys.platform == "linux":
             self._memory = memory
         return np.frombuffer(memory, dtype=self._dtype).reshape(shape)
@@ -113,7 +95,7 @@ class ColumnStore:
         memory = self._memory
         if memory is None:
             return
-        step = max(self._capacity // STEPS, _STEP_SIZE // self._dtype.itemsize)
+        step = max(self._capacity // _STEPS, _STEP_SIZE // self._dtype.itemsize)
         first, self._ready = self._ready, min(self._capacity, stop + step)
         size, runs = self._dtype.itemsize, self._width
         if self._by_row:

@@ -20,7 +20,7 @@ from ..mcap.chunk import BODY_AT, FIXED_SIZE, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_LISTS, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
-from .buffers import STEPS, TimeStore
+from .buffers import TimeStore
 from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, Group, LayoutSorter, Stamping
 
 _LENGTH_AT = 1  # in a message record
@@ -216,7 +216,6 @@ class _GroupReader:
             () if self.groups else tuple(self._shared),
             stamping=self._stamping,
             pages=self._pages,
-            huge=self._reserve // STEPS,  # so much of a larger one is requested at first, too
         )
         if not self.groups and len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)

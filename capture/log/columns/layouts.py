@@ -242,7 +242,6 @@ class Group:
         *,
         stamping: Stamping | None = None,
         pages: FilePages | None = None,
-        huge: int = 0,
     ) -> None:
         """Start empty.
 
@@ -251,7 +250,6 @@ class Group:
             others: Times of other topics, which may be equal.
             stamping: Shared with other topics; None for a new one.
             pages: Storage of large columns in files; None for memory.
-            huge: Most memory of a field that is taken in huge pages [byte].
         """
         self.layout = layout
         self._stamping = stamping or Stamping()
@@ -264,7 +262,7 @@ class Group:
         self.kept_times = TimeStore(capacity, stamped=self.is_stamped, others=others)
         self._order: list[IntArray | range] = []
         self._columns = {
-            path: ColumnStore(leaf.dtype, leaf.count, capacity, pages, huge=huge)
+            path: ColumnStore(leaf.dtype, leaf.count, capacity, pages)
             for path, leaf in leaves.items()
             if leaf not in (self._stamp or ()) and (paths is None or path in paths)
         }

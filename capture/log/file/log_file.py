@@ -13,7 +13,6 @@ import sys
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -35,27 +34,22 @@ _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linu
 """glibc's (malloc_trim(3)); other allocators have none."""
 
 
-def new_pages(size: int, *, huge: bool = False) -> mmap.mmap:
-    """Return zeroed memory, which is allocated when it is first written.
+def new_pages(size: int) -> mmap.mmap:
+    """Return zeroed memory of small pages, which are allocated when they are first written.
 
-    A bytearray would write all of it at once.
+    numpy would request huge pages, and in a virtual machine a new one costs milliseconds; a
+    bytearray would write all of it at once.
 
     Args:
         size: Size [byte], more than 0.
-        huge: Allocate in huge pages if the system grants them: that takes a quarter of the time,
-            but a single byte allocates 2 MiB.
 
     Raises:
         MemoryError: If there is not enough memory.
     """
     try:
-        memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     except OSError as error:
         raise MemoryError(f"{size} bytes for what is read") from error
-    if huge and hasattr(mmap, "MADV_HUGEPAGE"):
-        with suppress(OSError):  # a kernel without them
-            memory.madvise(mmap.MADV_HUGEPAGE)
-    return memory
 
 
 def keep_freed(size: int) -> None:
