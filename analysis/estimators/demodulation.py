@@ -125,8 +125,9 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
     filled = np.diff(starts)
     along, across = (cycle_sums(one, starts) for one in (cosine, sine))
     square, mixed = (cycle_sums(cosine * one, starts) for one in (cosine, sine))
+    other = cycle_sums(sine * sine, starts)  # not the rest of the count: 0 would be singular
     gram = np.array(  # of 1, cos and -sin
-        [[filled, along, -across], [along, square, -mixed], [-across, -mixed, filled - square]]
+        [[filled, along, -across], [along, square, -mixed], [-across, -mixed, other]]
     )
     right = np.stack(
         [

@@ -75,7 +75,7 @@ COUNTS = [20, pytest.param(60, marks=pytest.mark.slow)]
 
 
 def each_trace(check, count):
-    """Check so many drawn traces, and the one that has every kind of frame."""
+    """Check so many drawn traces, and the trace with every kind of frame."""
     how = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "database": None}
     settings(max_examples=count, **how)(example(EVERY_KIND)(given(traces)(check)))()
 
