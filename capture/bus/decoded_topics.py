@@ -13,14 +13,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
 from ..common.arrays import FloatArray, IntArray
-from ..log.write.channels import JointStateChannel
+from ..log.write.channels import (
+    ImuChannel,
+    JointStateChannel,
+    MagneticFieldChannel,
+    RangeChannel,
+)
 from ..log.write.writer import SessionWriter, open_sensor
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import BusSignal, Quantity, Robot, Sensor, SensorKind
@@ -149,17 +153,38 @@ _STAMPS_KEPT = 10_000
 
 
 @dataclass(frozen=True)
-class Message:
-    """A message that is ready to be written.
+class TopicMessages:
+    """Messages of one topic that are ready to be written.
 
     Attributes:
-        sampled_ns: Time of its last sample [Unix ns].
-        write: Writes it; takes the log time [Unix ns].
+        sampled_ns: Time of the last sample of each [Unix ns], shape (n,).
+        t_ns: Sampling time of each, its stamp [Unix ns], shape (n,).
+        values: Shape (n, ...).
+        write_rows: Writes them: times, values, log times [Unix ns].
     """
 
     topic: str
-    sampled_ns: int
-    write: Callable[[int], None]
+    sampled_ns: IntArray
+    t_ns: IntArray
+    values: FloatArray
+    write_rows: Callable[[IntArray, FloatArray, IntArray], None]
+
+    def __len__(self) -> int:
+        """Return the number of messages n."""
+        return len(self.t_ns)
+
+    def part(self, which: slice | IntArray) -> TopicMessages:
+        """Return some of the messages."""
+        sampled_ns, t_ns, values = self.sampled_ns[which], self.t_ns[which], self.values[which]
+        return replace(self, sampled_ns=sampled_ns, t_ns=t_ns, values=values)
+
+    def write(self, log_ns: IntArray) -> None:
+        """Write them.
+
+        Args:
+            log_ns: When each is recorded [Unix ns], shape (n,).
+        """
+        self.write_rows(self.t_ns, self.values, log_ns)
 
 
 class DecodedTopics:
@@ -177,13 +202,14 @@ class DecodedTopics:
         self._sensors = [_SensorTopic(writer, sensor) for sensor in robot.sensors]
         self._sensor_targets = _Targets([sensor.name for sensor in robot.sensors])
 
-    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
+    def add(self, samples: Sequence[DecodedSignals]) -> list[TopicMessages]:
         """Take the samples of one block of frames.
 
         Returns:
-            The messages that are complete now, in no order.
+            The messages that are complete now; sample times of joints ahead of their samples, so
+            that none is left without its time if writing ends between them.
         """
-        messages: list[Message] = []
+        messages: list[TopicMessages] = []
         for group in self._groups:
             messages += group.add(samples)
         pieces: dict[int, list[_Piece]] = {}
@@ -198,7 +224,7 @@ class DecodedTopics:
             messages += self._sensors[sensor].messages(own_pieces)
         return messages
 
-    def finish(self) -> list[Message]:
+    def finish(self) -> list[TopicMessages]:
         """Return the messages that waited for more samples."""
         return [message for group in self._groups for message in group.finish()]
 
@@ -248,35 +274,49 @@ class _OffsetTopic:
         self._channel: JointStateChannel | None = None
         self._written: OrderedDict[int, bytes] = OrderedDict()
 
-    def place(
-        self, stamp_ns: int, sampled_ns: int, offset_s: FloatArray
-    ) -> tuple[int, list[Message]]:
-        """Return a stamp for a round, and the offset message unless it was written before.
+    def place(self, rounds: Rounds) -> tuple[IntArray, list[TopicMessages]]:
+        """Return a stamp for each round, and the offset messages that were not written before.
 
         Rounds of several topics that come in the same frames share a stamp and its offsets. A
         stamp that stands for other offsets is left to them: this round gets one that is earlier
         by nanoseconds (later at the begin of 1970, as none is negative), and its offsets grow by as
         much, so that no sample moves.
         """
-        if len(self._joints) == 1:
-            return stamp_ns, []
+        if len(self._joints) == 1 or not len(rounds.stamp_ns):
+            return rounds.stamp_ns, []
+        stamps_ns, fresh, offsets_s = rounds.stamp_ns.tolist(), list[int](), list[FloatArray]()
+        for k, offset_s in enumerate(rounds.offset_s):
+            stamps_ns[k], own = self._place(stamps_ns[k], offset_s)
+            if own is not None:
+                fresh.append(k)
+                offsets_s.append(own)
+        placed_ns = np.array(stamps_ns, dtype=np.int64)
+        if not fresh:
+            return placed_ns, []
+        if self._channel is None:
+            self._channel = self._writer.joint_state(self._topic, self._joints, unit="s")
+        channel, none = self._channel, np.empty((len(fresh), 0))
+
+        def write_rows(t_ns: IntArray, values: FloatArray, log_ns: IntArray) -> None:
+            empty = none[: len(t_ns)]
+            channel.write_rows(t_ns, values, empty, empty, log_time_ns=log_ns)
+
+        sampled_ns, values = rounds.last_ns[fresh], np.array(offsets_s)
+        messages = TopicMessages(self._topic, sampled_ns, placed_ns[fresh], values, write_rows)
+        return placed_ns, [messages]
+
+    def _place(self, stamp_ns: int, offset_s: FloatArray) -> tuple[int, FloatArray | None]:
+        """Return a round's stamp, and its offsets unless they are written."""
         step_ns = -1 if stamp_ns > _STAMPS_KEPT else 1
         while (known := self._written.get(stamp_ns)) is not None:
             if known == offset_s.tobytes():
-                return stamp_ns, []
+                return stamp_ns, None
             stamp_ns += step_ns
             offset_s = offset_s - step_ns * 1e-9
         self._written[stamp_ns] = offset_s.tobytes()
         if len(self._written) > _STAMPS_KEPT:
             self._written.popitem(last=False)
-        if self._channel is None:
-            self._channel = self._writer.joint_state(self._topic, self._joints, unit="s")
-        channel = self._channel
-
-        def write(log_ns: int) -> None:
-            channel.write(stamp_ns, offset_s, log_time_ns=log_ns)
-
-        return stamp_ns, [Message(self._topic, sampled_ns, write)]
+        return stamp_ns, offset_s
 
     def forget(self) -> None:
         """Write all further offsets: the messages of the last call may be lost."""
@@ -303,7 +343,7 @@ class _JointGroup:
             columns = slice(first, first + len(quantities))
             self._topics.append(_JointTopic(writer, joints, quantities, columns))
 
-    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
+    def add(self, samples: Sequence[DecodedSignals]) -> list[TopicMessages]:
         blocks = self._blocks(samples)
         if not blocks:
             return []
@@ -311,7 +351,7 @@ class _JointGroup:
             blocks = [self._together(blocks)]
         return self._messages(self._gatherer.add(*blocks[0][1:]))
 
-    def finish(self) -> list[Message]:
+    def finish(self) -> list[TopicMessages]:
         return self._messages(self._gatherer.finish())
 
     def forget(self) -> None:
@@ -355,15 +395,10 @@ class _JointGroup:
         merged_t[place] = t_ns
         return keys // len(self._joints), merged_t, keys % len(self._joints), merged
 
-    def _messages(self, rounds: Rounds) -> list[Message]:
-        messages: list[Message] = []
-        for k, (stamp_ns, sampled_ns) in enumerate(
-            zip(rounds.stamp_ns.tolist(), rounds.last_ns.tolist(), strict=True)
-        ):
-            own_ns, offset_messages = self._offsets.place(stamp_ns, sampled_ns, rounds.offset_s[k])
-            messages += offset_messages
-            for topic in self._topics:
-                messages += topic.messages(own_ns, sampled_ns, rounds.values[k])
+    def _messages(self, rounds: Rounds) -> list[TopicMessages]:
+        stamp_ns, messages = self._offsets.place(rounds)
+        for topic in self._topics:
+            messages += topic.messages(stamp_ns, rounds)
         return messages
 
 
@@ -381,30 +416,34 @@ class _JointTopic:
         self._quantities, self._columns = quantities, columns
         self._channel: JointStateChannel | None = None
 
-    def messages(self, stamp_ns: int, sampled_ns: int, row: FloatArray) -> list[Message]:
-        """The message of one round, unless nothing of this topic was in it; row: (joints, all)."""
-        values = row[:, self._columns]
-        if np.isnan(values).all():
+    def messages(self, stamp_ns: IntArray, rounds: Rounds) -> list[TopicMessages]:
+        """The messages of the rounds that have anything of this topic."""
+        values = rounds.values[:, :, self._columns]
+        known = ~np.isnan(values).all(axis=(1, 2))
+        if not known.any():
             return []
-        topic = JOINT_TOPIC[self._quantities[0]]
+        first, rest = self._quantities[0], self._quantities[1:]
         if self._channel is None:
             self._channel = self._writer.joint_state(
-                topic,
+                JOINT_TOPIC[first],
                 self._joints,
-                unit=SESSION_UNIT[self._quantities[0]],
-                velocity=Quantity.VELOCITY in self._quantities[1:],
-                effort=Quantity.EFFORT in self._quantities[1:],
+                unit=SESSION_UNIT[first],
+                velocity=Quantity.VELOCITY in rest,
+                effort=Quantity.EFFORT in rest,
             )
         channel = self._channel
-        fields = dict(zip(self._quantities, values.T, strict=True))
-        first = fields.pop(self._quantities[0])
-        velocity = fields.get(Quantity.VELOCITY, ())
-        effort = fields.get(Quantity.EFFORT, ())
+        column = {quantity: k for k, quantity in enumerate(self._quantities)}
 
-        def write(log_ns: int) -> None:
-            channel.write(stamp_ns, first, velocity, effort, log_time_ns=log_ns)
+        def write_rows(t_ns: IntArray, values: FloatArray, log_ns: IntArray) -> None:
+            none = np.empty((len(t_ns), 0))
+            velocity, effort = (
+                values[:, :, column[quantity]] if quantity in rest else none
+                for quantity in _BESIDE_POSITION
+            )
+            channel.write_rows(t_ns, values[:, :, 0], velocity, effort, log_time_ns=log_ns)
 
-        return [Message(topic, sampled_ns, write)]
+        own = stamp_ns[known], values[known]
+        return [TopicMessages(JOINT_TOPIC[first], rounds.last_ns[known], *own, write_rows)]
 
 
 def _groups_of(decoder: Decoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
@@ -453,25 +492,23 @@ class _SensorTopic:
 
     def __init__(self, writer: SessionWriter, sensor: Sensor) -> None:
         self._writer, self._sensor = writer, sensor
-        self._write: Callable[[FloatArray, int, int], None] | None = None
+        self._channel: ImuChannel | MagneticFieldChannel | RangeChannel | None = None
 
-    def messages(self, pieces: Sequence[_Piece]) -> list[Message]:
+    def messages(self, pieces: Sequence[_Piece]) -> list[TopicMessages]:
         """Join the values of each frame into one message."""
         if not any(len(rows) for _, rows, _, _ in pieces):
             return []
-        if self._write is None:
-            self._write = open_sensor(self._writer, self._sensor)
-        write, topic = self._write, self._sensor.topic
+        if self._channel is None:
+            self._channel = open_sensor(self._writer, self._sensor)
         if len(pieces) == 1 and self._sensor.kind in _SCALAR:
             _, _, t_ns, row = pieces[0]
             values = row[:, None]
         else:
             t_ns, values = _side_by_side(pieces)
         known = ~np.isnan(values).all(axis=1)  # a frame of several sensors may be of the others
-        return [
-            Message(topic, t, partial(write, row, t))
-            for t, row in zip(t_ns[known].tolist(), values[known], strict=True)
-        ]
+        t_ns = t_ns[known]
+        topic, write_rows = self._sensor.topic, self._channel.write_rows
+        return [TopicMessages(topic, t_ns, t_ns, values[known], write_rows)]
 
 
 def _side_by_side(pieces: Sequence[_Piece]) -> tuple[IntArray, FloatArray]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from zstandard import STRATEGY_FAST, ZstdCompressionParameters
 
-from ..bus.decoded_topics import DecodedTopics, Message
+from ..bus.decoded_topics import DecodedTopics, TopicMessages
 from ..bus.decoders import open_decoder
 from ..bus.decoding import DecodedSignals, FrameTally
 from ..common.arrays import NS, IntArray
@@ -231,6 +231,14 @@ def import_can(
     return report
 
 
+@dataclass(frozen=True)
+class _RawMessage:
+    topic: str
+    log_ns: int
+    channel: FrameChannel
+    frames: FrameArray
+
+
 class _Import:
     """One import at work."""
 
@@ -248,13 +256,13 @@ class _Import:
         self._unseen = set(robot.joint_names)
 
     def add(self, block: LogBlock) -> None:
-        messages: list[Message] = []
+        raw, messages = list[_RawMessage](), list[TopicMessages]()
         for index, name in enumerate(self._log.buses):
             own = block[block.bus == index]
             if not len(own):
                 continue
-            messages += self._raw_messages(FRAME_TOPIC_PREFIX + name, own.classic())
-            messages += self._raw_messages(FD_TOPIC_PREFIX + name, own.frames[own.is_fd])
+            raw += self._raw_messages(FRAME_TOPIC_PREFIX + name, own.classic())
+            raw += self._raw_messages(FD_TOPIC_PREFIX + name, own.frames[own.is_fd])
             if name != self._chosen:
                 self._other_buses[name] += len(own)
             elif self._decoder is not None and self._topics is not None:
@@ -262,13 +270,13 @@ class _Import:
                 self._tally.add(tally)
                 self._unseen -= _targets(samples) if self._unseen else set()
                 messages += self._topics.add(samples)
-        self._write(messages)
+        self._write(raw, messages)
         self._note_times(block.times_ns())
 
     def finish(self) -> None:
         report, log = self._report, self._log
         if self._topics is not None:
-            self._write(self._topics.finish())
+            self._write([], self._topics.finish())
         report.problems += log.problems + self._tally.problems()
         if self._backward:
             report.problems.append(f"{self._backward} frames are stamped before the one ahead")
@@ -290,11 +298,23 @@ class _Import:
         all_joints = not self._unseen
         return undecoded(self._report.robot, tally.decoded, frames, others, all_joints=all_joints)
 
-    def _write(self, messages: list[Message]) -> None:
-        for message in sorted(messages, key=lambda message: message.sampled_ns):
-            message.write(message.sampled_ns)
-            samples = self._report.samples
-            samples[message.topic] = samples.get(message.topic, 0) + 1
+    def _write(self, raw: list[_RawMessage], decoded: list[TopicMessages]) -> None:
+        """Write the messages of a block, topic by topic of each tenth of a second."""
+        samples, pieces = self._report.samples, list[tuple[int, _RawMessage | TopicMessages]]()
+        for messages in decoded:
+            order = np.argsort(messages.sampled_ns, kind="stable")
+            samples[messages.topic] = samples.get(messages.topic, 0) + len(messages)
+            for rows in _batches(messages.sampled_ns[order]):
+                part = messages.part(order[rows])
+                pieces.append((int(part.sampled_ns[0]), part))
+        for one in raw:
+            samples[one.topic] = samples.get(one.topic, 0) + 1
+            pieces.append((one.log_ns, one))
+        for _, piece in sorted(pieces, key=lambda item: item[0] // _BATCH_NS):
+            if isinstance(piece, TopicMessages):
+                piece.write(piece.sampled_ns)
+            else:
+                piece.channel.write(piece.log_ns, piece.frames)
 
     def _note_times(self, t_ns: IntArray) -> None:
         report = self._report
@@ -303,7 +323,7 @@ class _Import:
         report.start_ns = min(report.start_ns, int(t_ns.min()))
         report.end_ns = max(report.end_ns, int(t_ns.max()))
 
-    def _raw_messages(self, topic: str, frames: FrameArray) -> Iterator[Message]:
+    def _raw_messages(self, topic: str, frames: FrameArray) -> Iterator[_RawMessage]:
         """Yield batches of raw frames; their log times increase, so that their order is kept."""
         if not len(frames):
             return
@@ -312,15 +332,15 @@ class _Import:
             self._channels[topic] = opened(topic)
         channel = self._channels[topic]
         t_ns = np.maximum.accumulate(frames["t_host_ns"].astype(np.int64))
-        ends = np.flatnonzero(np.diff(t_ns // _BATCH_NS)) + 1
-        for batch in np.split(np.arange(len(frames)), ends):
+        for batch in _batches(t_ns):
             latest_ns = max(self._latest_ns.get(topic, 0) + 1, int(t_ns[batch[-1]]))
             self._latest_ns[topic] = latest_ns
-            yield Message(topic, latest_ns, _writing(channel, frames[batch]))
+            yield _RawMessage(topic, latest_ns, channel, frames[batch])
 
 
-def _writing(channel: FrameChannel, frames: FrameArray) -> Callable[[int], None]:
-    return lambda log_ns: channel.write(log_ns, frames)
+def _batches(t_ns: IntArray) -> list[IntArray]:
+    """Return the indices of increasing times, shape (n,), in one piece for each period."""
+    return np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(t_ns // _BATCH_NS)) + 1)
 
 
 def _targets(samples: Iterable[DecodedSignals]) -> set[str]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ..bus.decoded_topics import DecodedTopics, Message
+from ..bus.decoded_topics import DecodedTopics, TopicMessages
 from ..bus.decoders import open_decoder
 from ..bus.decoding import FrameTally
 from ..common.errors import LogWriteError, UsageError
@@ -141,7 +141,7 @@ class BusRecorder:
         self._pieces: deque[FrameArray] = deque()  # pieces of a slice that failed
         self._failures = 0
         self._faults: Counter[str] = Counter()
-        self._messages: deque[Message] = deque()  # of the slice before, yet to be written
+        self._messages: deque[TopicMessages] = deque()  # of the slice before, yet to be written
         self._slice_size = _FEWEST
         self._took_ns = 0  # of the last slice
         self.tally = FrameTally()
@@ -211,8 +211,8 @@ class BusRecorder:
 
         Args:
             now_ns: The session's clock.
-            until_ns: No message is written after this time [Unix ns], and no slice is begun that
-                would last longer, except for the first of the call.
+            until_ns: No topic's messages are written after this time [Unix ns], and no slice is
+                begun that would last longer, except for the first of the call.
             rest: Also decode the frames of an incomplete slice, which cost more each.
         """
         now, idle = now_ns(), True
@@ -244,7 +244,7 @@ class BusRecorder:
                 return
             self._failures = 0
             self.tally.add(tally)
-            self._hold(messages)
+            self._messages.extend(messages)
         self._took_ns = time.thread_time_ns() - begun_ns
         if self._took_ns > _LONG_NS:
             self._slice_size = max(self._slice_size // 2, _FEWEST)
@@ -304,22 +304,22 @@ class BusRecorder:
         if self._topics is None:
             return
         try:
-            self._hold(self._topics.finish())
+            self._messages.extend(self._topics.finish())
         except Exception as error:  # noqa: BLE001 - reported; the raw frames are safe
             self._faults[repr(error)] += 0
         self.decode(now_ns, 1 << 63)
 
-    def _write(self, message: Message, now_ns: int) -> None:
+    def _write(self, messages: TopicMessages, now_ns: int) -> None:
         try:
-            message.write(now_ns)
+            messages.write(np.full(len(messages), now_ns))
         except LogWriteError:
             raise
         except Exception as error:  # noqa: BLE001 - reported; the other messages are written
-            self._faults[f"{error!r} on {message.topic}"] += 0
-
-    def _hold(self, messages: list[Message]) -> None:
-        messages.sort(key=lambda message: message.sampled_ns)
-        self._messages.extend(messages)
+            if len(messages) == 1:
+                self._faults[f"{error!r} on {messages.topic}"] += 0
+                return
+            for k in range(len(messages)):
+                self._write(messages.part(slice(k, k + 1)), now_ns)
 
 
 def _batches(fresh: list[FrameArray]) -> Iterator[FrameArray]:

@@ -20,10 +20,11 @@ from ..common.errors import DataError
 from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
 from ..log.health.tallies import BusHealth, JointHealth
+from ..log.mcap.batch import MessageBatch, MessageFields
 from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX
-from ..log.write.mcap_sink import Description, MessageFields
+from ..log.write.mcap_sink import Description
 from ..robot.model import Robot
 from ..sources.contract import Source
 from .source_clock import SourceClock
@@ -106,6 +107,13 @@ class LiveHealth:
         """Keep a message for the next round; see :meth:`MessageSink.write`."""
         channel_id, log_time_ns, _, sequence, payload = message
         self._pending[channel_id].append((log_time_ns, sequence, payload))
+
+    def offer_batch(self, batch: MessageBatch) -> None:
+        """Keep messages for the next round; see :meth:`MessageSink.write_batch`."""
+        self._pending[batch.channel_id] += [
+            (log_time_ns, sequence, payload)
+            for _, log_time_ns, _, sequence, payload in batch.messages
+        ]
 
     def step(self, now_ns: int) -> None:
         """Scan the messages of one channel, once a second each; called every tick.

@@ -26,7 +26,8 @@ from typing import NamedTuple
 from mcap.records import Channel
 
 from ..common.errors import MissingExtraError, UndulogError
-from ..log.write.mcap_sink import Description, MessageFields
+from ..log.mcap.batch import MessageBatch, MessageFields
+from ..log.write.mcap_sink import Description
 from .live_wire import (
     HEAD_SIZE,
     MAX_DATAGRAM,
@@ -256,6 +257,12 @@ class LiveFeed:
         self._queued_bytes += size + RECORD_SIZE
         if self._queued_bytes > self._max_bytes or len(self._queue) > self._max_messages:
             self._drop_oldest()
+
+    def offer_batch(self, batch: MessageBatch) -> None:
+        """Queue messages if a relay was found; see :meth:`MessageSink.write_batch`."""
+        if batch.channel_id in self._due or batch.channel_id in self._states:
+            for message in batch.messages:
+                self.offer(*message)
 
     def pump(self) -> None:
         """Send waiting datagrams, for 0.3 ms at most; called once a tick."""

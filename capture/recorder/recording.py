@@ -19,8 +19,9 @@ from mcap.records import Metadata
 from ..common.arrays import NS
 from ..common.errors import LogWriteError, SocketInUseError, SourceError, UsageError
 from ..common.process import StopRequest
+from ..log.mcap.batch import MessageBatch, MessageFields
 from ..log.write.durable_sink import DurableSink
-from ..log.write.mcap_sink import Description, MessageFields, MessageSink
+from ..log.write.mcap_sink import Description, MessageSink
 from ..log.write.ring_sink import RingStorage
 from ..log.write.writer import SessionWriter
 from ..sources.contract import SourceContext, open_sources
@@ -109,6 +110,7 @@ class TappedSink:
         self._write = sink.write
         self._listeners = tuple(listeners)
         self._offers = tuple(listener.offer for listener in listeners)
+        self._batch_offers = tuple(listener.offer_batch for listener in listeners)
 
     def define(self, record: Description) -> None:
         """See :meth:`MessageSink.define`."""
@@ -121,6 +123,12 @@ class TappedSink:
         self._write(*message)
         for offer in self._offers:
             offer(*message)
+
+    def write_batch(self, batch: MessageBatch) -> None:
+        """See :meth:`MessageSink.write_batch`."""
+        self._sink.write_batch(batch)
+        for offer in self._batch_offers:
+            offer(batch)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """See :meth:`MessageSink.close`."""

@@ -274,7 +274,7 @@ class SessionLog:
                 ranged = isinstance(sample, RangeSample)
                 values = np.array([sample.distance]) if ranged else sample.vector
                 t_ns = self._epoch_ns + round(sample.time_s * 1e9)
-                self._sensors[sample.name](values, t_ns, self._t_ns)
+                self._sensors[sample.name].write(t_ns, values, log_time_ns=self._t_ns)
 
     def _write_joints(self, sample: JointSample) -> None:
         t_ns, now_ns = self._epoch_ns + sample.cycle * _TICK_NS, self._t_ns

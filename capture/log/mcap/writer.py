@@ -40,10 +40,9 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
 from ...common.process import Piece
+from .batch import SEQUENCE_MASK, MessageBatch
 from .chunk import BODY_AT, FIXED_SIZE, HEAD, MAGIC, MESSAGE, PREFIX_SIZE
 
 if TYPE_CHECKING:
@@ -258,33 +257,25 @@ class McapWriter:
             if self._begun:
                 self._finish_behind(log_time)
 
-    def add_messages(
-        self, channel_id: int, times_ns: IntArray, records: NDArray[np.uint8], sequence: int = 0
-    ) -> None:
-        """Add messages of one size to the chunk of their channel; the same bytes as one by one.
-
-        Args:
-            channel_id: Their channel, which is registered.
-            times_ns: When each was sampled and recorded [Unix ns], from 0, shape (n,).
-            records: Room for the head of a record, which is filled here, and the message, shape
-                (n, BODY_AT + size), C-contiguous.
-            sequence: The channel's own counter at the first one.
+    def add_batch(self, batch: MessageBatch) -> None:
+        """Add messages to the chunk of their channel, which is registered; as one by one.
 
         Raises:
             OSError: If the stream can't take a chunk that is full now.
         """
+        records, log_ns, channel_id = batch.records, batch.log_ns, batch.channel_id
         count, length = records.shape
         heads = records[:, :BODY_AT].view(_HEAD)[:, 0]
         heads["opcode"], heads["length"] = _OPCODE, length - PREFIX_SIZE
         heads["channel"] = channel_id
-        heads["sequence"] = (sequence + np.arange(count)) & 0xFFFF_FFFF
-        heads["log"] = heads["publish"] = times_ns
+        heads["sequence"] = (batch.sequence + np.arange(count)) & SEQUENCE_MASK
+        heads["log"], heads["publish"] = log_ns, batch.publish_ns
         chunk, at = self._chunk_of[channel_id], 0
         while at < count:
             room = max(0, self._chunk_size - len(chunk.data)) // length + 1
             some = records[at : at + room]
             entries = np.empty((len(some), 2), np.uint64)
-            entries[:, 0] = times_ns[at : at + room]
+            entries[:, 0] = log_ns[at : at + room]
             entries[:, 1] = len(chunk.data) + length * np.arange(len(some))
             self._index(chunk, channel_id).frombytes(entries.tobytes())
             chunk.data += some.data
@@ -292,7 +283,7 @@ class McapWriter:
             at += len(some)
             if len(chunk.data) > self._chunk_size:
                 self._finish_chunk(chunk)
-                self._finish_behind(int(times_ns[at - 1]))
+                self._finish_behind(int(log_ns[at - 1]))
 
     def _index(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
         """Return the index of a channel in a chunk, which begins with its first message."""

@@ -24,13 +24,14 @@ import signal
 import struct
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
 from ...common.errors import DataError, LogWriteError
+from ..mcap.batch import MessageFields
 from .format import (
     HEADER_SIZE,
     RECORD_BODY,
@@ -256,6 +257,45 @@ class Segment:
             page = self._at & -_PAGE
             self._whole, self._page_end = (page, self.last), page + _PAGE
         self.last = fields[0]
+        return True
+
+    def put_all(self, fields: tuple[int, int, int], messages: Sequence[MessageFields]) -> bool:
+        """Write records of one size, if all fit; see :meth:`put`.
+
+        Args:
+            fields: Running number of the first one, kind, mark.
+            messages: Channel id, log time, publish time, sequence number and payload of each.
+
+        Returns:
+            Whether there was room, and every number fits its field; if not, none counts.
+        """
+        position, kind, mark = fields
+        length = len(messages[0][-1])
+        size = (RECORD_SIZE + length + 7) & -8
+        start = first = self._at
+        if first + size * len(messages) > self._end:
+            return False
+        view, salt, pack, crc_size = self._view, self._salt, RECORD_BODY.pack, RECORD_CRC.size
+        try:
+            heads = [
+                pack(length, number, kind, mark, channel_id, sequence, log_time_ns, publish_time_ns)
+                for number, (channel_id, log_time_ns, publish_time_ns, sequence, _) in enumerate(
+                    messages, position
+                )
+            ]
+        except struct.error:
+            return False
+        for head, message in zip(heads, messages, strict=True):
+            body = head + message[-1]
+            view[start + crc_size : start + RECORD_SIZE + length] = body
+            RECORD_CRC.pack_into(view, start, crc32(body, salt))
+            start += size
+        self._at = start
+        if start > self._page_end:
+            page = start & -_PAGE
+            whole = max(0, page - first) // size
+            self._whole, self._page_end = (page, position - 1 + whole), page + _PAGE
+        self.last = position + len(messages) - 1
         return True
 
     @property

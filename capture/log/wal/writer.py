@@ -34,6 +34,7 @@ import errno
 import os
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Self
@@ -41,6 +42,7 @@ from typing import Self
 from mcap.opcode import Opcode
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError
+from ..mcap.batch import MessageFields
 from .format import (
     DEFINITIONS,
     MARK,
@@ -197,6 +199,23 @@ class WriteAheadLog:
             self._current.put(fields, payload)
         self._position = position
         return position
+
+    def append_all(self, messages: Sequence[MessageFields]) -> bool:
+        """Accept messages of one size if the segment has room for all of them.
+
+        Args:
+            messages: The arguments of :meth:`append` for each.
+
+        Returns:
+            Whether they are accepted. If not, none is: :meth:`append` them one by one, which goes
+            to the next segment, or says what is wrong.
+        """
+        position = self._position + 1
+        fields = (position, _MESSAGE, MARK)
+        if self._failure is not None or not self._current.put_all(fields, messages):
+            return False
+        self._position += len(messages)
+        return True
 
     def define(self, record: Definition) -> None:
         """Accept a definition, which is kept until the log is closed.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,11 +35,12 @@ from ..messages.frames import (
 Send = Callable[[int, int, bytes], None]
 """Writes one message: log time [ns], publish time [ns], bytes."""
 
-SendRows = Callable[[IntArray, NDArray[np.uint8]], None]
-"""Writes messages of one size, at times of recording and sampling [ns], (n,), as the records of
-:meth:`.McapWriter.add_messages`, (n, BODY_AT + size)."""
+SendRows = Callable[[IntArray, IntArray, NDArray[np.uint8]], None]
+"""Writes messages of one size: log times [ns], publish times [ns], (n,), and the records of a
+:class:`.MessageBatch`, (n, BODY_AT + size)."""
 
 _TIME = struct.Struct("<iI")
+_STAMP = "header.stamp.sec", "header.stamp.nanosec"
 _END_NS = 2**31 * NS
 _AT_ONCE = 1 << 20  # bytes of messages: a chunk
 _POSE_STEP = 2.0**-14  # transforms are a view aid: rounded, they compress
@@ -59,6 +60,9 @@ class Template:
     leaves: dict[str, Leaf]
     send: Send
     send_rows: SendRows
+    _layouts: dict[tuple[str, ...], np.dtype[np.void]] = field(
+        default_factory=dict[tuple[str, ...], np.dtype[np.void]]
+    )
 
     def view(self, path: str) -> NDArray[Any]:
         """Return the numbers of one field, as a writable view of the message.
@@ -74,11 +78,14 @@ class Template:
             return np.empty(0, dtype=np.float64)
         return np.frombuffer(self.message, dtype=leaf.dtype, count=leaf.count, offset=leaf.offset)
 
-    def emit_rows(self, t_ns: IntArray, values: Mapping[str, FloatArray]) -> None:
+    def emit_rows(
+        self, t_ns: IntArray, log_time_ns: IntArray | None, values: Mapping[str, FloatArray]
+    ) -> None:
         """Write many messages at once.
 
         Args:
-            t_ns: Sampling time of each, and its time of recording [Unix ns], shape (n,).
+            t_ns: Sampling time of each [Unix ns], shape (n,).
+            log_time_ns: Time of recording of each [Unix ns]; the sampling time if None.
             values: Field path to numbers, shape (n, count) or (n,); the others are the template's.
 
         Raises:
@@ -87,19 +94,9 @@ class Template:
         """
         if len(t_ns) and not 0 <= int(t_ns.min()) <= int(t_ns.max()) < _END_NS:
             raise DataError(f"times from {t_ns.min()} to {t_ns.max()} ns don't fit 32 bits of s")
-        stamp = ("header.stamp.sec", "header.stamp.nanosec")
-        leaves = [self.leaves[path] for path in (*stamp, *values)]
-        size = BODY_AT + len(self.message)
-        layout = np.dtype(
-            {
-                "names": [leaf.path for leaf in leaves],
-                "formats": [
-                    (leaf.dtype, (leaf.count,)) if leaf.is_array else leaf.dtype for leaf in leaves
-                ],
-                "offsets": [BODY_AT + leaf.offset for leaf in leaves],
-                "itemsize": size,
-            }
-        )
+        log_ns = t_ns if log_time_ns is None else log_time_ns
+        layout = self._layout((*_STAMP, *values))
+        size = layout.itemsize
         step = max(1, _AT_ONCE // size)
         records = np.empty((min(step, len(t_ns)), size), np.uint8)
         records[:, BODY_AT:] = np.frombuffer(self.message, np.uint8)
@@ -107,10 +104,28 @@ class Template:
             times_ns = t_ns[at : at + step]
             mine = records[: len(times_ns)]
             rows = mine.view(layout)[:, 0]
-            rows[stamp[0]], rows[stamp[1]] = np.divmod(times_ns, NS)
+            rows[_STAMP[0]], rows[_STAMP[1]] = np.divmod(times_ns, NS)
             for path, numbers in values.items():
                 rows[path] = numbers[at : at + step]
-            self.send_rows(times_ns, mine)
+            self.send_rows(log_ns[at : at + step], times_ns, mine)
+
+    def _layout(self, paths: tuple[str, ...]) -> np.dtype[np.void]:
+        """Return the record of a message, with some of its fields by their paths."""
+        layout = self._layouts.get(paths)
+        if layout is None:
+            leaves = [self.leaves[path] for path in paths]
+            layout = self._layouts[paths] = np.dtype(
+                {
+                    "names": paths,
+                    "formats": [
+                        (leaf.dtype, (leaf.count,)) if leaf.is_array else leaf.dtype
+                        for leaf in leaves
+                    ],
+                    "offsets": [BODY_AT + leaf.offset for leaf in leaves],
+                    "itemsize": BODY_AT + len(self.message),
+                }
+            )
+        return layout
 
     def emit(self, t_ns: int, log_time_ns: int | None, stamps: Sequence[int]) -> None:
         """Stamp and write the message.
@@ -145,6 +160,12 @@ class _Stamped:
             view[0] = value
         self._template.emit(t_ns, log_time_ns, self._stamps)
 
+    def _emit_columns(
+        self, t_ns: IntArray, log_time_ns: IntArray | None, columns: Iterable[FloatArray]
+    ) -> None:
+        """Write many messages; a column, shape (n,), for each of the first paths."""
+        self._template.emit_rows(t_ns, log_time_ns, dict(zip(self._fields, columns, strict=False)))
+
 
 class JointStateChannel(_Stamped):
     """One value (and velocity, effort) per joint."""
@@ -177,9 +198,15 @@ class JointStateChannel(_Stamped):
         self._emit(t_ns, log_time_ns)
 
     def write_rows(
-        self, t_ns: IntArray, position: FloatArray, velocity: FloatArray, effort: FloatArray
+        self,
+        t_ns: IntArray,
+        position: FloatArray,
+        velocity: FloatArray,
+        effort: FloatArray,
+        *,
+        log_time_ns: IntArray | None = None,
     ) -> None:
-        """Write many samples at once, each recorded when it was sampled; see :meth:`write`.
+        """Write many samples at once; see :meth:`write`.
 
         Args:
             t_ns: Sampling times [Unix ns], shape (n,).
@@ -197,7 +224,7 @@ class JointStateChannel(_Stamped):
                 raise ValueError(f"{path} has the shape {numbers.shape}, not (n, {len(view)})")
             if len(view):
                 values[path] = numbers
-        self._template.emit_rows(t_ns, values)
+        self._template.emit_rows(t_ns, log_time_ns, values)
 
     def part(self, names: Sequence[str]) -> JointStateChannel:
         """Return the channel for messages of some of the joints only, with the same fields."""
@@ -281,14 +308,18 @@ class RangeChannel(_Stamped):
 
     _fields = ("range",)
 
-    def write(self, t_ns: int, value: float, *, log_time_ns: int | None = None) -> None:
+    def write(self, t_ns: int, value: ArrayLike, *, log_time_ns: int | None = None) -> None:
         """Write one sample.
 
         Args:
-            value: Distance [m]; +inf if nothing is in range (REP 117).
+            value: Distance [m], shape () or (1,); +inf if nothing is in range (REP 117).
         """
-        self._views[0][0] = value
+        self._views[0][:] = value
         self._emit(t_ns, log_time_ns)
+
+    def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
+        """Write many samples at once, shape (n, 1); see :meth:`write`."""
+        self._emit_columns(t_ns, log_time_ns, values.T)
 
 
 class MagneticFieldChannel(_Stamped):
@@ -303,6 +334,10 @@ class MagneticFieldChannel(_Stamped):
             vector: In the sensor's frame [T], shape (3,).
         """
         self._emit_numbers(t_ns, log_time_ns, vector)
+
+    def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
+        """Write many samples at once, shape (n, 3); see :meth:`write`."""
+        self._emit_columns(t_ns, log_time_ns, values.T)
 
 
 class ImuChannel(_Stamped):
@@ -332,6 +367,12 @@ class ImuChannel(_Stamped):
         gyro = (0.0, 0.0, 0.0) if angular_velocity is None else angular_velocity
         covariance = -1.0 if angular_velocity is None else 0.0
         self._emit_numbers(t_ns, log_time_ns, (*acceleration, *gyro, covariance))
+
+    def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
+        """Write many samples without a gyroscope at once, shape (n, 3); see :meth:`write`."""
+        none = np.zeros(len(t_ns))
+        self._views[-1][0] = -1.0
+        self._emit_columns(t_ns, log_time_ns, [*values.T, none, none, none])
 
 
 class TimeReferenceChannel(_Stamped):

@@ -13,12 +13,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, TypeAlias
 
-import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
-from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
 from ...common.errors import DataError, LogWriteError, OutputExistsError
+from ..mcap.batch import MessageBatch, MessageFields
 from ..mcap.writer import Compression, McapWriter
 
 if TYPE_CHECKING:
@@ -40,10 +38,6 @@ def chunk_group(topic: str, type_name: str) -> str:
 
 Description: TypeAlias = Schema | Channel | Attachment | Metadata
 """Definitions, which come before the messages that need them."""
-
-
-MessageFields: TypeAlias = tuple[int, int, int, int, bytes]
-"""Channel id, log time [ns], publish time [ns], sequence number and payload of a message."""
 
 
 class MessageSink(Protocol):
@@ -70,6 +64,13 @@ class MessageSink(Protocol):
 
         Raises:
             LogWriteError: If it can't be stored.
+        """
+
+    def write_batch(self, batch: MessageBatch) -> None:
+        """Store messages, as one by one.
+
+        Raises:
+            LogWriteError: If one can't be stored; those before it are.
         """
 
     def close(self, last: tuple[Metadata, ...]) -> None:
@@ -131,15 +132,9 @@ class McapSink:
         channel_id, log_time_ns, publish_time_ns, sequence, payload = message
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
 
-    def write_rows(
-        self, channel_id: int, times_ns: IntArray, sequence: int, records: NDArray[np.uint8]
-    ) -> None:
-        """Store messages of one size at once; see :meth:`.McapWriter.add_messages`.
-
-        Raises:
-            LogWriteError: If they can't be stored.
-        """
-        self._writer.add_messages(channel_id, times_ns, records, sequence)
+    def write_batch(self, batch: MessageBatch) -> None:
+        """See :meth:`MessageSink.write_batch`."""
+        self._writer.add_batch(batch)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """See :meth:`MessageSink.close`."""

@@ -22,9 +22,10 @@ from mcap.records import Channel, Metadata, Schema
 
 from ...common.amounts import format_size
 from ...common.errors import LogWriteError, UndulogError
+from ..mcap.batch import MessageBatch, MessageFields
 from ..messages.definitions import adds_up, is_latched
 from ..wal.segment import sync_folder
-from .mcap_sink import Description, McapSink, MessageFields, MessageSink, write_error
+from .mcap_sink import Description, McapSink, MessageSink, write_error
 
 MARK_RECORD = "undulog.mark"
 """Metadata record of a mark: its number, time, text, and the number of messages dropped before."""
@@ -157,6 +158,11 @@ class RingSink:
         while self.size > self._max_bytes and len(messages) > 1:
             self._drop_oldest()
             self.dropped += 1
+
+    def write_batch(self, batch: MessageBatch) -> None:
+        """See :meth:`MessageSink.write_batch`."""
+        for message in batch.messages:
+            self.write(*message)
 
     def mark(self, text: str = "") -> Path:
         """Write the ring's messages to a file, in a thread.

@@ -7,20 +7,20 @@ A sink stores the records. Without one they go straight to an MCAP file, which i
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from ...common.arrays import FloatArray, IntArray
+from ...common.arrays import IntArray
 from ...common.errors import DataError, LogWriteError
 from ...common.files import Closing
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
-from ..mcap.chunk import BODY_AT
+from ..mcap.batch import SEQUENCE_MASK, MessageBatch
 from ..messages.cdr import encode, layout_of
 from ..messages.definitions import CONTRACT_VERSION, message_type, schema_text
 from .channels import (
@@ -357,18 +357,15 @@ class SessionWriter(Closing):
             if not self._open:
                 raise LogWriteError(self.path, f"{topic}: the session is closed")
             write(channel_id, log_time_ns, stamp_ns, sequence, data)
-            sequence = (sequence + 1) & 0xFFFF_FFFF
+            sequence = (sequence + 1) & SEQUENCE_MASK
 
-        def send_rows(times_ns: IntArray, records: NDArray[np.uint8]) -> None:
+        def send_rows(log_ns: IntArray, t_ns: IntArray, records: NDArray[np.uint8]) -> None:
             nonlocal sequence
-            if not isinstance(sink, McapSink):
-                for t_ns, record in zip(times_ns.tolist(), records, strict=True):
-                    send(t_ns, t_ns, record[BODY_AT:].tobytes())
-                return
             if not self._open:
                 raise LogWriteError(self.path, f"{topic}: the session is closed")
-            sink.write_rows(channel_id, times_ns, sequence, records)
-            sequence = (sequence + len(times_ns)) & 0xFFFF_FFFF
+            batch = MessageBatch(channel_id, log_ns, t_ns, sequence, records)
+            sequence = (sequence + len(t_ns)) & SEQUENCE_MASK  # also if some are not accepted
+            sink.write_batch(batch)
 
         return send, send_rows
 
@@ -385,23 +382,19 @@ class SessionWriter(Closing):
         return Template(bytearray(example), leaves, *self._senders(topic, type_name, metadata))
 
 
-SensorWrite: TypeAlias = Callable[[FloatArray, int, int], None]
-"""Writes a distance, shape (1,), or a vector, shape (3,), with sampling and log time [Unix ns]."""
-
-
-def open_sensor(writer: SessionWriter, sensor: Sensor) -> SensorWrite:
+def open_sensor(
+    writer: SessionWriter, sensor: Sensor
+) -> ImuChannel | MagneticFieldChannel | RangeChannel:
     """Open a sensor's channel on the topic of its description; its frame has its name.
 
     Raises:
         DataError: If the topic is open already.
     """
     if sensor.kind is SensorKind.ACCELEROMETER:
-        imu = writer.imu(sensor.topic, frame=sensor.name)
-        return lambda values, t_ns, log_ns: imu.write(t_ns, values, log_time_ns=log_ns)
+        return writer.imu(sensor.topic, frame=sensor.name)
     if sensor.kind is SensorKind.COMPASS:
-        compass = writer.magnetic_field(sensor.topic, frame=sensor.name)
-        return lambda values, t_ns, log_ns: compass.write(t_ns, values, log_time_ns=log_ns)
-    distance = writer.range(
+        return writer.magnetic_field(sensor.topic, frame=sensor.name)
+    return writer.range(
         sensor.topic,
         frame=sensor.name,
         min_range=sensor.range_min or 0.0,
@@ -409,4 +402,3 @@ def open_sensor(writer: SessionWriter, sensor: Sensor) -> SensorWrite:
         field_of_view=sensor.field_of_view or 0.0,
         infrared=sensor.kind is SensorKind.IR,
     )
-    return lambda values, t_ns, log_ns: distance.write(t_ns, float(values[0]), log_time_ns=log_ns)

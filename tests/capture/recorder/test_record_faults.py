@@ -105,7 +105,7 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(stage, tmp_path, m
     owner, method, fails = {
         "decode": (BusDecoder, "decode", lambda _, args: (args[0]["t_device_ns"] % 200 == 1).any()),
         "map": (SourceClock, "add", lambda call, _: call % 3 == 0),
-        "write": (JointStateChannel, "write", lambda call, _: call % 11 == 0),
+        "write": (JointStateChannel, "write_rows", lambda call, _: call % 11 == 0),
     }[stage]
     original, calls = getattr(owner, method), itertools.count(1)
 

@@ -23,6 +23,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from undulog.capture.common.process import helpers
+from undulog.capture.log.mcap.batch import MessageBatch
 from undulog.capture.log.mcap.chunk import BODY_AT
 from undulog.capture.log.mcap.writer import McapWriter
 
@@ -64,7 +65,8 @@ def add_rows(writer, channel, times, data, sequence):
         rows[:, BODY_AT:] = np.frombuffer(b"".join(payloads), np.uint8).reshape(
             len(times), len(data)
         )
-        writer.add_messages(channel, np.array(times, np.uint64), rows, sequence)
+        times_ns = np.array(times, np.uint64)
+        writer.add_batch(MessageBatch(channel, times_ns, times_ns, sequence, rows))
         return
     for k, (t_ns, payload) in enumerate(zip(times, payloads, strict=True)):
         writer.add_message(channel, t_ns, payload, t_ns, sequence + k)

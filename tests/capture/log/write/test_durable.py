@@ -18,11 +18,20 @@ from support.read_back import messages_of, metadata_of, read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.mcap.batch import MessageBatch
+from undulog.capture.log.mcap.chunk import BODY_AT
 from undulog.capture.log.messages.definitions import ERROR, OK, DiagnosticStatus, schema_text
 from undulog.capture.log.write.durable_sink import DurableSink
 from undulog.capture.recorder.recording import TappedSink
 
 EPOCH_NS = recorder.EPOCH_NS
+
+
+def batch_of(channel_id, log_ns, publish_ns, sequence, payloads):
+    """Messages of one size as a batch."""
+    records = [np.frombuffer(bytes(BODY_AT) + payload, np.uint8) for payload in payloads]
+    times = np.array(log_ns), np.array(publish_ns)
+    return MessageBatch(channel_id, *times, sequence, np.array(records))
 
 
 def names(folder):
@@ -67,16 +76,24 @@ def test_a_session_is_the_same_through_either_sink(tmp_path):
 
 def test_listeners_get_what_was_accepted_and_nothing_else(tmp_path):
     offered = []
-    listener = SimpleNamespace(define=id, offer=lambda *message: offered.append(message))
+    listener = SimpleNamespace(
+        define=id,
+        offer=lambda *message: offered.append(message),
+        offer_batch=lambda batch: offered.extend(batch.messages),
+    )
     kept = recorder.open_sink(tmp_path / "run.mcap")
     sink = TappedSink(kept, [listener])
     for number in range(100):
         recorder.write(sink, number)
     with pytest.raises(DataError, match="out of range"):
         sink.write(1, -1, 0, 0, b"")
+    sink.write_batch(batch_of(1, [1, 2], [3, 4], 2**32 - 1, [b"ab", b"cd"]))
+    with pytest.raises(DataError, match="out of range"):
+        sink.write_batch(batch_of(1, [-1, 2], [3, 4], 5, [b"ab", b"cd"]))
     sink.close(())
-    assert offered == [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
-    assert (kept.messages, kept.part) == (100, 1)
+    one_by_one = [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
+    assert offered == [*one_by_one, (1, 1, 3, 2**32 - 1, b"ab"), (1, 2, 4, 0, b"cd")]
+    assert (kept.messages, kept.part) == (102, 1)
     assert kept.size == (tmp_path / "run.mcap").stat().st_size
 
 

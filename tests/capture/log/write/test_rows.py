@@ -9,9 +9,14 @@ from hypothesis.extra import numpy as arrays
 from support.read_back import decoded_of, messages_of
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import DataError
+from undulog.capture.log.wal.reader import recover
+from undulog.capture.log.wal.writer import WriteAheadLog
 from undulog.capture.log.write.durable_sink import DurableSink
+from undulog.capture.log.write.writer import open_sensor
+from undulog.capture.robot.model import Sensor, SensorKind
 
 EPOCH_NS = 1_700_000_000_000_000_000
+_SCALAR = (SensorKind.IR, SensorKind.SONAR)
 FACTS = {"session_id": "s", "epoch_ns": EPOCH_NS}
 
 
@@ -78,13 +83,72 @@ def test_a_foreign_decoder_reads_the_values(tmp_path, long_run):
     assert found[-1][1].name == names
 
 
-def test_through_the_write_ahead_log(tmp_path, long_run):
+@pytest.mark.parametrize("segment_size", [1 << 14, 1 << 20])
+def test_through_the_write_ahead_log(tmp_path, long_run, segment_size):
     names, times, fields = long_run
     some = names, times[:200], [field[:200] for field in fields]
     path = tmp_path / "run.mcap"
-    sink = DurableSink(path, segment_size=1 << 20, ballast=0)
+    sink = DurableSink(path, segment_size=segment_size, ballast=0)
     through = session(path, *some, at_once=True, sink=sink)
     assert through == session(tmp_path / "one.mcap", *some, at_once=False)
+
+
+def test_parts_of_a_split_session(tmp_path, long_run):
+    names, times, fields = long_run
+    some = names, times[:400], [field[:400] for field in fields]
+    found = []
+    for at_once in (False, True):
+        path = tmp_path / str(at_once) / "run.mcap"
+        path.parent.mkdir()
+        sink = DurableSink(path, split_ns=10**9, ballast=0)  # some boundaries are within a batch
+        session(path, *some, at_once=at_once, sink=sink)
+        parts = sorted(path.parent.glob("*.mcap"))
+        found.append([[m.data for *_, m in messages_of(part)] for part in parts])
+    assert found[0] == found[1]
+    assert len(found[0]) == 4
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    sizes=st.lists(st.tuples(st.integers(0, 3000), st.integers(1, 30)), max_size=20),
+    segment_size=st.sampled_from([1 << 12, 1 << 14, 1 << 16]),
+)
+def test_the_write_ahead_log_is_that_of_single_messages(sizes, segment_size, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wal")
+    found = []
+    for at_once in (False, True):
+        with WriteAheadLog(folder / str(at_once), segment_size=segment_size) as wal:
+            for k, (size, count) in enumerate(sizes):
+                messages = [(k, 7 * n, 9 * n, n, bytes([n]) * size) for n in range(count)]
+                if not (at_once and wal.append_all(messages)):
+                    for message in messages:
+                        wal.append(*message)
+        recovery = recover(folder / str(at_once))
+        found.append([message[:] for message in recovery])
+        assert (recovery.missing, recovery.before) == (0, 0)
+    assert found[0] == found[1]
+    assert len(found[0]) == sum(count for _, count in sizes)
+
+
+@pytest.mark.parametrize("kind", list(SensorKind))
+def test_sensors_many_at_once_as_one_by_one(tmp_path, kind):
+    values = np.random.default_rng(1).normal(size=(20, 1 if kind in _SCALAR else 3))
+    values[3] = np.nan
+    times, logged = EPOCH_NS + np.arange(20) * 7, EPOCH_NS + np.arange(20) * 7 + 5
+    sensor = Sensor("one", kind, "head", (0.0, 0.0, 0.0), range_min=0.1, range_max=4.0)
+    found = []
+    for at_once in (False, True):
+        path = tmp_path / f"{at_once}.mcap"
+        with SessionWriter(path, **FACTS) as writer:
+            channel = open_sensor(writer, sensor)
+            if at_once:
+                channel.write_rows(times, values, logged)
+            else:
+                for t_ns, row, log_ns in zip(times.tolist(), values, logged.tolist(), strict=True):
+                    channel.write(t_ns, row, log_time_ns=log_ns)
+        found.append([(m.log_time, m.publish_time, m.data) for *_, m in messages_of(path)])
+    assert found[0] == found[1]
+    assert len(found[0]) == 20
 
 
 def test_a_wrong_shape_is_refused(tmp_path):
