@@ -63,6 +63,7 @@ endef
 test: $(READY)  ## all tests but the slow ones
 	$(call tests,"not slow")
 
+slow: COMPUTING := $(filter-out tests/capture/exchange tests/replay/sweep tests/sim/twin,$(COMPUTING))
 slow: $(READY)  ## the slow tests
 	$(call tests,slow)
 

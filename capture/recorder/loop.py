@@ -30,7 +30,7 @@ from .status import EachSecond, SessionClock, TickTally
 TICK_NS = 20_000_000
 """Interval of polling the sources and writing their raw frames [ns]."""
 
-DECODE_TICKS = 5
+DECODE_TICKS = 10
 """Ticks between two rounds of decoding; a backlog is decoded in the next tick."""
 
 WATCHED_TICKS = 2

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-SESSIONS = 200
+SESSIONS = 100
 ANY, BROKEN, NAMED = 0.065, 0.01, 0.95
 CHANCE = 1e-3
 """A cell may be off by what chance makes of so few sessions; all cells together may not."""
@@ -28,7 +28,7 @@ def test_identical_joints_are_rarely_reported_to_differ():
 
 @pytest.mark.slow
 def test_a_joint_off_by_three_half_widths_is_named():
-    sessions = SESSIONS // 8
+    sessions = SESSIONS // 4
     cells = answer_tables.one_off(sessions)
     print(cells)
     for cell, (named, _) in cells.items():

@@ -13,7 +13,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,9 @@ SendRows = Callable[[IntArray, IntArray, NDArray[np.uint8]], None]
 """Writes messages of one size: log times [ns], publish times [ns], (n,), and the records of a
 :class:`.MessageBatch`, (n, BODY_AT + size)."""
 
+_Fields: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
+"""Paths of fields, each with the shape of its numbers in a message."""
+
 _TIME = struct.Struct("<iI")
 _STAMP = "header.stamp.sec", "header.stamp.nanosec"
 _END_NS = 2**31 * NS
@@ -60,8 +63,8 @@ class Template:
     leaves: dict[str, Leaf]
     send: Send
     send_rows: SendRows
-    _layouts: dict[tuple[str, ...], np.dtype[np.void]] = field(
-        default_factory=dict[tuple[str, ...], np.dtype[np.void]]
+    _layouts: dict[_Fields, np.dtype[np.void]] = field(
+        default_factory=dict[_Fields, np.dtype[np.void]]
     )
 
     def view(self, path: str) -> NDArray[Any]:
@@ -86,16 +89,17 @@ class Template:
         Args:
             t_ns: Sampling time of each [Unix ns], shape (n,).
             log_time_ns: Time of recording of each [Unix ns]; the sampling time if None.
-            values: Field path to numbers, shape (n, count) or (n,); the others are the template's.
+            values: Field path to numbers, shape (n,), or (n, count) for an array and for a field
+                with those behind it; the other fields are the template's.
 
         Raises:
             DataError: If a time isn't from 1970 to 2038, which a stamp can hold.
             ValueError: If a shape doesn't fit the field.
         """
-        if len(t_ns) and not 0 <= int(t_ns.min()) <= int(t_ns.max()) < _END_NS:
+        if len(t_ns) and t_ns.view(np.uint64).max() >= _END_NS:  # a negative one is huge
             raise DataError(f"times from {t_ns.min()} to {t_ns.max()} ns don't fit 32 bits of s")
         log_ns = t_ns if log_time_ns is None else log_time_ns
-        layout = self._layout((*_STAMP, *values))
+        layout = self._layout(tuple((path, one.shape[1:]) for path, one in values.items()))
         size = layout.itemsize
         step = max(1, _AT_ONCE // size)
         records = np.empty((min(step, len(t_ns)), size), np.uint8)
@@ -109,17 +113,17 @@ class Template:
                 rows[path] = numbers[at : at + step]
             self.send_rows(log_ns[at : at + step], times_ns, mine)
 
-    def _layout(self, paths: tuple[str, ...]) -> np.dtype[np.void]:
-        """Return the record of a message, with some of its fields by their paths."""
-        layout = self._layouts.get(paths)
+    def _layout(self, fields: _Fields) -> np.dtype[np.void]:
+        """Return the record of a message, with its stamp and some of its fields."""
+        layout = self._layouts.get(fields)
         if layout is None:
-            leaves = [self.leaves[path] for path in paths]
-            layout = self._layouts[paths] = np.dtype(
+            named = [*((path, ()) for path in _STAMP), *fields]
+            leaves = [self.leaves[path] for path, _ in named]
+            layout = self._layouts[fields] = np.dtype(
                 {
-                    "names": paths,
+                    "names": [path for path, _ in named],
                     "formats": [
-                        (leaf.dtype, (leaf.count,)) if leaf.is_array else leaf.dtype
-                        for leaf in leaves
+                        (leaf.dtype, shape) for leaf, (_, shape) in zip(leaves, named, strict=True)
                     ],
                     "offsets": [BODY_AT + leaf.offset for leaf in leaves],
                     "itemsize": BODY_AT + len(self.message),
@@ -160,11 +164,9 @@ class _Stamped:
             view[0] = value
         self._template.emit(t_ns, log_time_ns, self._stamps)
 
-    def _emit_columns(
-        self, t_ns: IntArray, log_time_ns: IntArray | None, columns: Iterable[FloatArray]
-    ) -> None:
-        """Write many messages; a column, shape (n,), for each of the first paths."""
-        self._template.emit_rows(t_ns, log_time_ns, dict(zip(self._fields, columns, strict=False)))
+    def _emit_first(self, t_ns: IntArray, log_time_ns: IntArray, values: FloatArray) -> None:
+        """Write many messages; values of the first fields, which lie side by side, (n, count)."""
+        self._template.emit_rows(t_ns, log_time_ns, {self._fields[0]: values})
 
 
 class JointStateChannel(_Stamped):
@@ -319,7 +321,7 @@ class RangeChannel(_Stamped):
 
     def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
         """Write many samples at once, shape (n, 1); see :meth:`write`."""
-        self._emit_columns(t_ns, log_time_ns, values.T)
+        self._emit_first(t_ns, log_time_ns, values)
 
 
 class MagneticFieldChannel(_Stamped):
@@ -337,7 +339,7 @@ class MagneticFieldChannel(_Stamped):
 
     def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
         """Write many samples at once, shape (n, 3); see :meth:`write`."""
-        self._emit_columns(t_ns, log_time_ns, values.T)
+        self._emit_first(t_ns, log_time_ns, values)
 
 
 class ImuChannel(_Stamped):
@@ -370,9 +372,9 @@ class ImuChannel(_Stamped):
 
     def write_rows(self, t_ns: IntArray, values: FloatArray, log_time_ns: IntArray) -> None:
         """Write many samples without a gyroscope at once, shape (n, 3); see :meth:`write`."""
-        none = np.zeros(len(t_ns))
-        self._views[-1][0] = -1.0
-        self._emit_columns(t_ns, log_time_ns, [*values.T, none, none, none])
+        for view, unknown in zip(self._views[3:], (0.0, 0.0, 0.0, -1.0), strict=True):
+            view[0] = unknown
+        self._emit_first(t_ns, log_time_ns, values)
 
 
 class TimeReferenceChannel(_Stamped):

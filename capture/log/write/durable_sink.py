@@ -214,7 +214,7 @@ class DurableSink:
         if (
             not usual
             or not len(batch.log_ns)
-            or int(batch.log_ns.max()) >= self._split_at_ns
+            or (self._split_ns is not None and int(batch.log_ns.max()) >= self._split_at_ns)
             or not self._wal.append_all(batch.messages)
         ):
             for message in batch.messages:

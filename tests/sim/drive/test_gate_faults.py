@@ -97,8 +97,11 @@ def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(driving):
 
 @pytest.mark.slow
 def test_lost_replies_end_it_and_name_the_joint(driving):
-    with driving(f"lost:joint02:1@{FAULT_AT_S}") as drive:
-        _, err, written = drive.ended()
+    for _ in range(3):
+        with driving(f"lost:joint02:1@{FAULT_AT_S}") as drive:
+            _, err, written = drive.ended()
+        if "the bus was silent" not in err:  # of a machine so busy that no reply came for 30 ms
+            break
     assert err.startswith("error: joint02 is lost: no angle for more than 1 s; the joints were bro")
     check_told(written, "joint02 is lost: no angle for more than 1 s")
     gate_stage.check_ramp_down(written, "fault: ")
