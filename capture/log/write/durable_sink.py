@@ -222,7 +222,8 @@ class DurableSink:
             return
         part = self._part
         size = part.size
-        self._writer.add_batch(batch)
+        for channel_id, log_ns, publish_ns, sequence, payload in batch.messages:
+            self._writer.add_message(channel_id, log_ns, payload, publish_ns, sequence)
         self.messages += len(batch.log_ns)
         if part.size != size:
             self._chunk_done()
