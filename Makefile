@@ -49,9 +49,9 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 
 # Two processes at once: tests that compute, and tests of processes, time and pictures.
 COMPUTING = tests/analysis tests/docs \
-  $(addprefix tests/capture/,exchange following robot) \
+  $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw sweep) \
-  $(addprefix tests/sim/,batch gait physics scenario twin)
+  $(addprefix tests/sim/,batch physics scenario)
 define tests
 	@log=$$(mktemp); \
 	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \
@@ -63,7 +63,7 @@ endef
 test: $(READY)  ## all tests but the slow ones
 	$(call tests,"not slow")
 
-slow: COMPUTING := $(filter-out tests/capture/exchange tests/replay/sweep tests/sim/twin,$(COMPUTING))
+slow: COMPUTING := $(filter-out tests/replay/sweep,$(COMPUTING))
 slow: $(READY)  ## the slow tests
 	$(call tests,slow)
 
