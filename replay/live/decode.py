@@ -32,7 +32,8 @@ from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, ordered, with
 PATIENCE_NS = 250_000_000
 """How long a quantity without new samples delays those computed from it [ns]."""
 
-_OFFSETS_KEPT = 64
+_OFFSETS_KEPT = 1024
+"""A recorder writes those of a slice of frames ahead of the samples that they time."""
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _RANGE = "sensor_msgs/msg/Range"
