@@ -10,8 +10,10 @@ import pty
 import re
 import signal
 import sys
+import tempfile
 import time
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,8 +58,9 @@ class Driving:
 def driving(small, session, tmp_path):
     @contextmanager
     def start(*faults, scenario=small[1], recorded=session, plain=False):
-        path = tmp_path / "a.mcap"
-        with staged(tmp_path, scenario, *faults) as stage:
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a test may drive several times
+        path = folder / "a.mcap"
+        with staged(folder, scenario, *faults) as stage:
             if plain:  # python-can's own socketcand: the robot isn't asked who it is
                 stage.on += "&plain=yes"
             with stage.replay(recorded, path) as controller:
