@@ -299,7 +299,7 @@ class _Import:
         return undecoded(self._report.robot, tally.decoded, frames, others, all_joints=all_joints)
 
     def _write(self, raw: list[_RawMessage], decoded: list[TopicMessages]) -> None:
-        """Write the messages of a block, topic by topic of each tenth of a second."""
+        """Write the messages of a block, topic by topic for each 50 ms."""
         samples, pieces = self._report.samples, list[tuple[int, _RawMessage | TopicMessages]]()
         for messages in decoded:
             order = np.argsort(messages.sampled_ns, kind="stable")

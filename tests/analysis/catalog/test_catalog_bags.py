@@ -1,4 +1,4 @@
-"""Bags in the catalogue: of every kind, damaged, and told apart by their content."""
+"""Bags in the catalogue: of every kind, damaged, and distinguished by their content."""
 
 import os
 import shutil

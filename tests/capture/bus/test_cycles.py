@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.capture.bus.decoded_topics import LONGEST_ROUND_NS, RoundGatherer
+from undulog.capture.bus.rounds import LONGEST_ROUND_NS, RoundGatherer
 
 SAMPLES = st.lists(
     st.tuples(st.integers(0, 4), st.integers(-1_000_000, 60_000_000)), min_size=1, max_size=60
