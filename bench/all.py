@@ -18,6 +18,7 @@ import tempfile
 import time
 from dataclasses import asdict
 from datetime import UTC, datetime
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,7 +78,7 @@ BENCHES = {
 
 PEERS = (
     "mcap", "mcap-ros2-support", "rosbags", "pandas", "pyarrow", "python-can", "dynamixel-sdk",
-    "mujoco", "pybullet", "rerun-sdk", "numpy", "scipy", "numba",
+    "mujoco", "pybullet", "rerun-sdk", "numpy", "scipy", "numba", "numba-cuda",
 )  # fmt: skip
 
 
@@ -112,7 +113,7 @@ def run_bench(name: str, *, quick: bool) -> dict[str, Any]:
         "took_s": round(time.monotonic() - clock, 1),
         "load": round(os.getloadavg()[0], 1),
         "machine": machine(),
-        "versions": ", ".join(versions(one) for one in ("undulog", *PEERS)),
+        "versions": ", ".join(versions(one) for one in ("undulog", *PEERS) if installed(one)),
         "exit": code,
         "rows": rows,
     }
@@ -123,13 +124,25 @@ def missing(data: dict[str, Any]) -> list[str]:
     return [name for name in BENCHES if name not in data]
 
 
+def installed(distribution: str) -> bool:
+    """Return whether a package is installed."""
+    return any(distributions(name=distribution))
+
+
 def machine() -> str:
-    """Return processor, cores, memory, kernel and Python."""
+    """Return processor, cores, GPUs, memory, kernel and Python."""
     facts = Path("/proc/cpuinfo").read_text().splitlines()
     model = next(line.partition(":")[2].strip() for line in facts if line.startswith("model name"))
+    gpus = [
+        line.partition(":")[2].strip()
+        for one in Path("/proc/driver/nvidia/gpus").glob("*/information")
+        for line in one.read_text().splitlines()
+        if line.startswith("Model:")
+    ]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return (
-        f"{model}, {os.cpu_count()} cores, {memory:.0f} GiB, Linux {platform.release()}, "
+        f"{', '.join((model, f'{os.cpu_count()} cores', *gpus))}, {memory:.0f} GiB, "
+        f"Linux {platform.release()}, "
         f"Python {platform.python_version()}"
     )
 

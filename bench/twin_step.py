@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeVar
 
-import pybullet
 from measuring import arguments, chain, in_turn, took
 from records import compared, versions
 
@@ -50,6 +49,8 @@ def step_twin(scenario: Scenario, kernels: Kernels) -> float:
 
 def step_builtin(scenario: Scenario) -> float:
     """Return seconds of processor time a step, with the engine's own contacts and motors."""
+    import pybullet  # where its wheels end (Python 3.12), the other benches still run
+
     client = pybullet.connect(pybullet.DIRECT)
     try:
         body = built_in_body(scenario.robot, client)
@@ -77,6 +78,8 @@ def step_builtin(scenario: Scenario) -> float:
 
 def built_in_body(robot: Robot, client: int) -> int:
     """Return the same chain with capsules that collide, on a plane."""
+    import pybullet
+
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
     pybullet.setTimeStep(1e-3, physicsClientId=client)
     ground = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)

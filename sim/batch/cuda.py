@@ -15,8 +15,10 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
+from numba.core.errors import NumbaPerformanceWarning
 from numba.extending import overload
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
@@ -111,10 +113,13 @@ def run_block_on_gpu(*block: Any) -> None:
     filled = [cuda.device_array(array.shape, array.dtype) for array in (samples, poses)]
     filled[0][0].copy_to_device(samples[0])
     known = [cuda.to_device(array) for array in (ground, gravity, vertical, commands, limits)]
-    _kernel(links.dtype)[-(-lanes // _THREADS), _THREADS](
-        *(state[0], state[1], *known[:3], law, known[3], *filled, state[2], known[4]),
-        *times,
-    )
+    with catch_warnings():
+        # That few runs don't fill the GPU: their number is the caller's.
+        simplefilter("ignore", NumbaPerformanceWarning)
+        _kernel(links.dtype)[-(-lanes // _THREADS), _THREADS](
+            *(state[0], state[1], *known[:3], law, known[3], *filled, state[2], known[4]),
+            *times,
+        )
     for array, copy in zip((links, head, failure), state, strict=True):
         copy.copy_to_host(array)
     filled[0].copy_to_host(samples)
