@@ -15,10 +15,9 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from typing import Any
-from warnings import catch_warnings, simplefilter
+from warnings import catch_warnings, filterwarnings
 
 import numpy as np
-from numba.core.errors import NumbaPerformanceWarning
 from numba.extending import overload
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
@@ -115,7 +114,7 @@ def run_block_on_gpu(*block: Any) -> None:
     known = [cuda.to_device(array) for array in (ground, gravity, vertical, commands, limits)]
     with catch_warnings():
         # That few runs don't fill the GPU: their number is the caller's.
-        simplefilter("ignore", NumbaPerformanceWarning)
+        filterwarnings("ignore", ".*Grid size")
         _kernel(links.dtype)[-(-lanes // _THREADS), _THREADS](
             *(state[0], state[1], *known[:3], law, known[3], *filled, state[2], known[4]),
             *times,
