@@ -51,7 +51,7 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 COMPUTING = tests/analysis tests/docs \
   $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw sweep) \
-  $(addprefix tests/sim/,batch physics scenario)
+  $(addprefix tests/sim/,batch gait physics scenario)
 define tests
 	@log=$$(mktemp); \
 	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \

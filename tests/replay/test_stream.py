@@ -107,6 +107,7 @@ def test_a_short_session_arrives_as_it_is_saved(receive, session_file, analysis,
     assert "analysed:" not in facts[0]
 
 
+@pytest.mark.slow
 def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, tmp_path, read_back):
     notes, received = receive(long_file)
     with Session.open(long_file) as session:

@@ -50,6 +50,7 @@ def short(tmp_path_factory):
     return write_run(tmp_path_factory.mktemp("short") / "run.mcap", WAVE, CHAIN @ WAVE, 1, 0.003)
 
 
+@pytest.mark.slow
 def test_a_session_on_paper(chromium, tmp_path, command):
     pdf = tmp_path / "run.pdf"
     printed = command("report", GOLDEN, "--pdf", pdf).out.splitlines()
@@ -64,6 +65,7 @@ def test_a_session_on_paper(chromium, tmp_path, command):
     assert pages(pdf) > 3
 
 
+@pytest.mark.slow
 def test_page_and_paper_together(chromium, tmp_path, report_of):
     html, pdf = tmp_path / "run.html", tmp_path / "run.pdf"
     result = report_of("report", GOLDEN, "-o", html, "--pdf", pdf)
@@ -72,6 +74,7 @@ def test_page_and_paper_together(chromium, tmp_path, report_of):
     assert sorted(tmp_path.iterdir()) == [html, pdf]
 
 
+@pytest.mark.slow
 def test_the_browser_asks_no_network(chromium, tmp_path, command):
     log = tmp_path / "net.json"
     with_log = script(tmp_path, f'exec {chromium} --log-net-log={log} "$@"')
@@ -126,6 +129,7 @@ def test_a_browser_that_hangs_is_ended_with_its_children(tmp_path):
     assert processes_of(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_browser(short, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -142,6 +146,7 @@ def test_ctrl_c_ends_the_browser(short, tmp_path):
     assert processes_of(hanging) == []
 
 
+@pytest.mark.slow
 def test_several_sessions_by_themselves_on_paper(chromium, tmp_path, command):
     pdf = tmp_path / "both.pdf"
     done = command("report", GOLDEN, GOLDEN, "--each", "--pdf", pdf, "--json").out

@@ -120,6 +120,7 @@ def check(coupling, robot, *, h, z, seconds):
         assert tone["condition_number"] == pytest.approx(np.linalg.cond(H), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_short_chain(tmp_path):
     """Five joints, three of them yaw joints, at 2 Hz."""
     robot = world(tmp_path, 5, 2.0)

@@ -109,6 +109,7 @@ def test_intervals_of_rates_hold_under_scatter(draws):
     assert np.mean(inside) >= 0.91
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_kick_has_an_interval():
     J = rates_of(*kick_tables.chain(5))
     off = 0.1 * (np.arange(5) == 2)

@@ -96,6 +96,7 @@ def test_on_paper_nothing_is_cut(browser, address):
     assert browser.evaluate(BEYOND.replace(".broad, ", "")) == []
 
 
+@pytest.mark.slow
 def test_a_broad_matrix_has_a_page_across_and_is_not_cut(browser, snake, tmp_path):
     rng = np.random.default_rng(3)
     for count in (25, 60):

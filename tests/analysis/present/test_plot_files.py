@@ -41,6 +41,7 @@ def assert_no_placeholders(path):
     assert not {*map(tuple, seen)} & {*SENTINELS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["svg", "png"])
 def test_each_figure_of_the_page_is_a_file(kind, run, tmp_path, command):
     folder = tmp_path / "figures"

@@ -207,6 +207,7 @@ def test_each_bin_of_a_quadrupeds_chirp_is_predicted_by_the_others():
     assert (np.abs(np.mean(apart, axis=0) - white) < 3 * scatter).all()
 
 
+@pytest.mark.slow
 @needs_recordings
 def test_a_quadrupeds_chirp_is_one_input(tmp_path):
     with zipfile.ZipFile(SHARED / "go2/traj_0.pt") as archive:

@@ -224,6 +224,7 @@ def test_too_slow_or_too_few_samples_for_a_group_are_reported():
     assert any("too few response samples" in text for text in notes)
 
 
+@pytest.mark.slow
 def test_the_shared_frequencies_have_intervals_that_hold():
     """Commands and responses with noise of 5 mrad; 40 draws of two frequencies."""
     snake = Snake(GOLDEN, joints=6)

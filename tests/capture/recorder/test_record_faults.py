@@ -63,6 +63,7 @@ TIMES = ("9300000000.0", "99999999999.0", "-1.5", "nan", "inf", "1e300", "9" * 3
 """What stands where socketcand writes a frame's time."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
 def test_an_impossible_time_of_socketcand_ends_no_decoding(first, tmp_path):
     frames = polling()[1::2]  # a server marks no directions: answers only

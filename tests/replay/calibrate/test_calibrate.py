@@ -50,6 +50,7 @@ def small(tmp_path_factory):
 TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03")
 
 
+@pytest.mark.slow
 def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
     report, found = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
@@ -223,6 +224,7 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "rho"), [(300, 0.0), (300, 0.8), (1000, 0.9)])
 def test_intervals_of_a_linear_model_cover(n, rho):
     """Three joints, four parameters whose columns are two harmonics of three or ten cycles."""

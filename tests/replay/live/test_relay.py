@@ -67,6 +67,7 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
 
 
+@pytest.mark.slow
 def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
     recorder, first = stage.recorder(), stage.relay("first.rrd")
@@ -108,6 +109,7 @@ def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     assert len(centres) > 100  # at the origin, without odometry
 
 
+@pytest.mark.slow
 def test_noise_on_the_socket_is_counted_and_borne(stage):
     recorder, relay = stage.recorder(), stage.relay()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
@@ -120,6 +122,7 @@ def test_noise_on_the_socket_is_counted_and_borne(stage):
     assert (report["unread"], report["sessions"]) == (3, ["made-for-tests"])
 
 
+@pytest.mark.slow
 def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
     recorder, relay = stage.recorder(), stage.relay()
     recorder.connect()

@@ -87,6 +87,7 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
     assert rows_of(output) == local
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path):
     address = f"tcp://127.0.0.1:{free_port()}"
     done = undulog(

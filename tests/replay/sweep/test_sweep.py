@@ -60,6 +60,7 @@ def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path, command
         assert analyse_session(session).answer.sentence == row.sentence
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
     plan = write_plan(tmp_path, (0.1, 0.2), seeds=2)
     first, _ = swept(plan, tmp_path / "rows")
@@ -83,6 +84,7 @@ def test_a_dry_run_runs_nothing(reference, tmp_path, command, report_of):
     assert (there["to_run"], there["estimated_s"]) == (0, 0)
 
 
+@pytest.mark.slow
 def test_a_failed_run_keeps_its_error_and_can_be_run_again(tmp_path):
     plan = write_plan(tmp_path, (0.3, -1.0, "strong", 0.2))
     report, code = swept(plan, tmp_path / "rows")
@@ -99,6 +101,7 @@ def test_a_failed_run_keeps_its_error_and_can_be_run_again(tmp_path):
     assert pd.read_parquet(tmp_path / "rows" / "rows").key.is_unique
 
 
+@pytest.mark.slow
 def test_parameters_of_robot_and_analysis(tmp_path):
     plan = write_plan(tmp_path, (0.3,))
     plan.write_text(

@@ -95,6 +95,7 @@ def test_gain_and_lag_over_5_s_are_those_of_the_twin_on_mujoco(weak):
     np.testing.assert_allclose(found, expected, atol=1e-11)  # the bar is 1e-5
 
 
+@pytest.mark.slow
 def test_single_precision_keeps_gain_and_lag_within_a_thousandth(weak):
     scenario = weak.changed(duration_s=5.0)
     yaw = scenario.robot.joint_indices(Plane.HORIZONTAL)

@@ -200,6 +200,7 @@ def refused(folder, scenario, sessions):
     return noted
 
 
+@pytest.mark.slow
 def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     bare, _ = gate_stage.robot_files(tmp_path / "bare", safety=None)
     session = gate_stage.commanded(tmp_path / "limits.mcap", bare, 1.0)
@@ -253,6 +254,7 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(dri
 # -- who is in charge goes ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_ctrl_c_brings_the_joints_down(driving):
     with driving() as drive:
         drive.begun(60)

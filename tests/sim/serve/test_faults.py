@@ -69,6 +69,7 @@ def test_what_is_no_fault_is_refused_with_what_would_be(text, why):
 numbers = st.floats(1e-3, 0.9)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.builds(

@@ -34,6 +34,7 @@ def served(tmp_path):
     assert not port.is_symlink()
 
 
+@pytest.mark.slow
 def test_the_vendors_sdk_drives_it_and_a_second_adapter_records_it(tmp_path, served):
     _, ready = served
     log = tmp_path / "run.mcap"

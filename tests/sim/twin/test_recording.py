@@ -326,6 +326,7 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, name, command):
     assert np.abs(angles).max(initial=0.0) < np.pi
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing_and_no_traceback(disk_of):
     disk = disk_of("400k")
     done = undulog("sim", "run", "flat", "-o", disk / "run.mcap", "--duration", "60", code=1)

@@ -186,6 +186,7 @@ def damage(rng, folder):
     return hit
 
 
+@pytest.mark.slow
 def test_whatever_bytes_there_are_only_true_messages_come_out(tmp_path, quick_folder):
     source = filled(tmp_path / "source", 40)
     originals = {path.name: path.read_bytes() for path in source.iterdir()}
