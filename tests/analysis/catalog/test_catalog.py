@@ -1,10 +1,11 @@
 """The catalogue against the sessions themselves, the mcap package and many writers at once."""
 
 import json
-import multiprocessing
 import os
 import shutil
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -270,10 +271,10 @@ def _write_many(arguments):
 
 @pytest.mark.slow
 def test_many_writers_at_once_lose_no_row(lab):
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "duckdb", "pyarrow.parquet"])  # imported once
-    with context.Pool(16) as pool:
-        pool.map(_write_many, [(str(lab), number) for number in range(16)], chunksize=1)
+    # Each imports all by itself: libraries that have threads can't be forked safely.
+    with ProcessPoolExecutor(16, get_context("spawn")) as pool:
+        done = pool.map(_write_many, [(str(lab), number) for number in range(16)], timeout=600)
+        assert list(done) == [*range(16)]
     catalog = Catalog(str(lab))
     names = catalog.sql("select session_id from analyses where source not like '%.json'").session_id
     assert sorted(names) == sorted(f"{number}-{k}" for number in range(16) for k in range(20))
