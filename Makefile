@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures golden lock \
+.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures pages golden lock \
   release install-paths clean
 
 help:  ## this list
@@ -100,6 +100,9 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
 	$(BIN)/python docs/readme_figures.py docs/images
+
+pages: $(READY)  ## the page on recordings of real robots (DATA=FOLDER with the recordings)
+	$(BIN)/python docs/real_robots.py $(or $(DATA),../shared/data)
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py
