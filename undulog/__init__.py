@@ -154,6 +154,9 @@ _GROUPS = {
 
 _COMPLETION = "--install-completion"
 
+_OF_LINEAR_ALGEBRA = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""The matrices are small: more threads wait for each other, on a busy machine for most of the time.
+What the user has set stays."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """What writing to a full or failing disk raises."""
 
@@ -323,6 +326,8 @@ def main() -> None:
         gc.disable()  # a seventh of the time, and the process ends with the help
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
+    for name in _OF_LINEAR_ALGEBRA:
+        os.environ.setdefault(name, "1")
     try:
         from undulog.capture.common.extras import defer
 

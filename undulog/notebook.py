@@ -13,7 +13,8 @@ They open what they are given by path and close it again; an open session stays 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
@@ -43,10 +44,11 @@ def analyse(session: SessionLike, /, *more: SessionLike, options: Options | None
     """
     from undulog.analysis import analyse_experiment, analyse_session
 
-    if more:
-        return analyse_experiment(_each([session, *more]), options)
-    with _opened(session) as view:
-        return analyse_session(view, options)
+    with _one_thread_of_linear_algebra():
+        if more:
+            return analyse_experiment(_each([session, *more]), options)
+        with _opened(session) as view:
+            return analyse_session(view, options)
 
 
 def compare(
@@ -69,7 +71,8 @@ def compare(
     def group(side: SessionLike | Iterable[SessionLike]) -> Iterable[SessionView]:
         return _each([side] if isinstance(side, SessionView | Path | str) else side)
 
-    return compare_sessions(group(a), group(b), choices)
+    with _one_thread_of_linear_algebra():
+        return compare_sessions(group(a), group(b), choices)
 
 
 def record(
@@ -107,7 +110,20 @@ def record(
     elif changes:
         raise UsageError("changes are for a scenario's name or file, not for one that is read")
     chosen = scenario.changed(duration_s=duration_s, seed=seed)
-    return record_scenario(chosen, path, force=force)
+    with _one_thread_of_linear_algebra():
+        return record_scenario(chosen, path, force=force)
+
+
+def _one_thread_of_linear_algebra() -> AbstractContextManager[object]:
+    """Keep NumPy and SciPy from threads of their own, as the command does by its environment.
+
+    The matrices are small: more threads wait for each other, on a busy machine for most of the
+    time.
+    """
+    from threadpoolctl import threadpool_limits
+
+    import_module("scipy.linalg")  # what is loaded later isn't limited
+    return threadpool_limits(1, "blas")
 
 
 @contextmanager

@@ -159,13 +159,14 @@ def slow_changes(series: FloatArray, cycle: FloatArray, noise: CycleNoise) -> Sl
         The fit; steady where there are fewer than ``MIN_CYCLES`` cycles.
     """
     place = cycle - cycle[0]
-    white, *correlated = _noises(place, noise.relative)
+    noises = _noises(place, noise.relative)  # found as they are needed: c x c matrices
+    white = next(noises)
     # Scatter that noise within the cycles explains has no correlation from cycle to cycle.
     grid = [white]
     shapes = _clearest(series, place, grid)
     excess = _excess(shapes, white, series, noise)
     if excess < EXCESS:
-        grid = [white, *correlated]
+        grid = [white, *noises]
         shapes = _clearest(series, place, grid)
     return _inferred(series, place, shapes, grid, excess)
 

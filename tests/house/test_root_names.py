@@ -1,11 +1,13 @@
 """The names of ``import undulog``: imported when used, typed, and paths in, results out."""
 
+import os
 import sys
 import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import undulog
 from support import processes
@@ -98,3 +100,42 @@ def test_a_strangers_program_is_typed_by_the_installed_wheel(tmp_path):
     errors = [line for line in found.splitlines() if " error: " in line]
     assert len(errors) == 1, found
     assert "stranger.py:20:" in errors[0]
+
+
+THREADS = """
+import os, sys, undulog
+sys.argv = ["undulog", "--version"]
+try:
+    undulog.main()
+except SystemExit:
+    import numpy
+    print(len(os.listdir("/proc/self/task")))
+"""
+
+
+def threads_of_numpy(**environment):
+    inherited = {key: value for key, value in os.environ.items() if "NUM_THREADS" not in key}
+    return int(python(THREADS, env=inherited | environment, code=0).stdout.split()[-1])
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="there is one core")
+def test_the_command_has_one_thread_of_linear_algebra_unless_told():
+    """More wait for each other: on a busy machine ``analyse`` took four times as long."""
+    assert threads_of_numpy() == 1
+    assert threads_of_numpy(OPENBLAS_NUM_THREADS="2") == 2
+
+
+def test_a_notebook_has_one_thread_of_linear_algebra_while_it_analyses(runs, monkeypatch):
+    seen, analyse_session = [], undulog.analysis.analyse_session
+
+    def watched(*args):
+        seen.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+        return analyse_session(*args)
+
+    monkeypatch.setattr("undulog.analysis.analyse_session", watched)
+    with threadpool_limits(2, "blas"):
+        before = [one["num_threads"] for one in threadpool_info()]
+        undulog.analyse(runs / "a.mcap")
+        assert [one["num_threads"] for one in threadpool_info()] == before
+    assert seen
+    assert set(seen) == {1}
