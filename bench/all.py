@@ -140,11 +140,8 @@ def machine() -> str:
         if line.startswith("Model:")
     ]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return (
-        f"{', '.join((model, f'{os.cpu_count()} cores', *gpus))}, {memory:.0f} GiB, "
-        f"Linux {platform.release()}, "
-        f"Python {platform.python_version()}"
-    )
+    system = f"Linux {platform.release()}", f"Python {platform.python_version()}"
+    return ", ".join((model, f"{os.cpu_count()} cores", f"{memory:.0f} GiB", *gpus, *system))
 
 
 def main() -> int:

@@ -158,12 +158,12 @@ def response_row(one: dict[str, Any]) -> tuple[str, ...]:
 def inputs_line(data: Path) -> str:
     """Return the page's last line: SHA-256 of recordings, script, text, packages and product."""
     root = HERE.parent
-    product = ("capture", "sim", "analysis", "replay")
-    sources = {
-        **{name: root / name for name in ("docs/real_robots.py", "docs/real-robots.txt")},
-        "packages": root / "requirements.lock",
-        **{str(f.relative_to(root)): f for one in product for f in (root / one).rglob("*.py")},
-        **{str(f.relative_to(data)): f for one in RECORDINGS for f in (data / one).rglob("*.*")},
+    parts = ("capture", "sim", "analysis", "replay", "undulog")
+    own = [f for part in parts for f in (root / part).rglob("*") if "__pycache__" not in f.parts]
+    names = ("docs/real_robots.py", "docs/real-robots.txt", "requirements.lock")
+    own += [root / name for name in names]
+    sources = {str(f.relative_to(root)): f for f in own} | {
+        f"DATA/{f.relative_to(data)}": f for one in RECORDINGS for f in (data / one).rglob("*")
     }
     digest = hashlib.sha256()
     for name, source in sorted(sources.items()):
