@@ -47,23 +47,26 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
-# Two processes at once: tests that compute, and tests of processes, time and pictures.
-COMPUTING = tests/analysis tests/docs \
+# Three processes at once: two of tests that compute, in the time that the third leaves them, which
+# has the tests of processes, time and pictures.
+ANALYSIS = tests/analysis
+COMPUTING = tests/docs tests/zoo/test_error_control.py tests/zoo/test_zoo.py \
   $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw sweep) \
-  $(addprefix tests/sim/,batch gait physics scenario)
+  $(addprefix tests/sim/,batch gait physics scenario twin)
 define tests
-	@log=$$(mktemp); \
-	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \
-	trap "kill $$first; rm -f $$log; exit 130" INT TERM; \
-	$(BIN)/python -m pytest -m $(1) $(addprefix --ignore=,$(COMPUTING)); second=$$?; \
-	wait $$first; first=$$?; cat $$log; rm -f $$log; exit $$((first + second))
+	@logs=$$(mktemp -d); \
+	nice -n 5 $(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(ANALYSIS) >$$logs/1 2>&1 & first=$$!; \
+	nice -n 5 $(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$logs/2 2>&1 & second=$$!; \
+	trap "kill $$first $$second; rm -rf $$logs; exit 130" INT TERM; \
+	$(BIN)/python -m pytest -m $(1) $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING)); third=$$?; \
+	wait $$first; first=$$?; wait $$second; second=$$?; cat $$logs/*; rm -rf $$logs; \
+	exit $$((first + second + third))
 endef
 
 test: $(READY)  ## all tests but the slow ones
 	$(call tests,"not slow")
 
-slow: COMPUTING := $(filter-out tests/replay/sweep,$(COMPUTING))
 slow: $(READY)  ## the slow tests
 	$(call tests,slow)
 
@@ -101,8 +104,11 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
 	$(BIN)/python docs/readme_figures.py docs/images
 
-pages: $(READY)  ## the page on recordings of real robots (DATA=FOLDER with the recordings)
-	$(BIN)/python docs/real_robots.py $(or $(DATA),../shared/data)
+DATA ?= ../shared/data
+pages: $(READY)  ## what takes long in the manual: real robots (DATA=FOLDER with recordings), study, tables
+	$(BIN)/python docs/real_robots.py $(DATA)
+	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -m slow tests/docs/test_study.py tests/docs/test_scripts.py
+	$(BIN)/python docs/built_from.py $(DATA)
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py

@@ -2,14 +2,12 @@
 
 ``python docs/real_robots.py DATA``: imports and analyses each public recording in ``DATA`` by the
 commands that the page shows, fills their numbers into ``real-robots.txt``, and writes
-``explanation/real-robots.md`` and the pictures beside it. With ``--out`` they go elsewhere. The
-page ends with a digest of all that it is made of, so that it need not be made again to be checked.
+``explanation/real-robots.md`` and the pictures beside it. With ``--out`` they go elsewhere.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import math
 import shlex
@@ -43,7 +41,6 @@ analyse joint-only.mcap -o joint-only.json
 analyse segment.mcap -o segment.json
 analyse motor.mcap -o motor.json
 """
-RECORDINGS = ("so101", "go2", "arcsnake")
 MAP = """delimiter = ","
 [time]
 column = "time"
@@ -155,24 +152,6 @@ def response_row(one: dict[str, Any]) -> tuple[str, ...]:
     return one["joint"], band, ends, width, delay, spread
 
 
-def inputs_line(data: Path) -> str:
-    """Return the page's last line: SHA-256 of recordings, script, text, packages and product."""
-    root = HERE.parent
-    parts = ("capture", "sim", "analysis", "replay", "undulog")
-    own = [f for part in parts for f in (root / part).rglob("*") if "__pycache__" not in f.parts]
-    names = ("docs/real_robots.py", "docs/real-robots.txt", "requirements.lock")
-    own += [root / name for name in names]
-    sources = {str(f.relative_to(root)): f for f in own} | {
-        f"DATA/{f.relative_to(data)}": f for one in RECORDINGS for f in (data / one).rglob("*")
-    }
-    digest = hashlib.sha256()
-    for name, source in sorted(sources.items()):
-        if source.is_file():
-            content = hashlib.sha256(source.read_bytes()).hexdigest()
-            digest.update(f"{name} {content}\n".encode())
-    return f"% made of {digest.hexdigest()}\n"
-
-
 def main() -> None:
     """Write the page and its pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -190,7 +169,6 @@ def main() -> None:
         commands = "\n".join(f"undulog {line}" for line in COMMANDS.strip().splitlines())
         for place, value in (values(folder) | {"commands": commands}).items():
             text = text.replace(f"@{place}@", value)
-    text += f"\n{inputs_line(given.data)}"
     (given.out / "explanation" / "real-robots.md").write_text(text)
 
 

@@ -9,13 +9,19 @@ from support.paths import ROOT
 from support.processes import run
 
 DOCS = ROOT / "docs"
-RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py", "result_schemas.py"}
-"""Run by Sphinx (``make docs``), the others by tests of their own, too."""
+RUN_ELSEWHERE = {
+    "built_from.py",
+    "conf.py",
+    "notebook_page.py",
+    "reference_pages.py",
+    "result_schemas.py",
+}
+"""Run by ``make pages`` and Sphinx (``make docs``), the others by tests of their own, too."""
 
 OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "pictures.py", "real_robots.py"}
 TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - OWN_TESTS)
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.built("scripts")]
 
 
 def printed(*words):

@@ -20,6 +20,7 @@ NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
 
 
 @pytest.mark.slow
+@pytest.mark.built("study")
 def test_the_short_form_reaches_the_conclusions(tmp_path):
     script = ROOT / "docs/study/study.py"
     run(sys.executable, str(script), "--quick", "--out", str(tmp_path), timeout=1800, code=0)
@@ -32,6 +33,7 @@ def test_the_short_form_reaches_the_conclusions(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.built("study")
 def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     results = results_of(LONG)
     assert [one for one in evaluate(results) if not one.holds] == []

@@ -62,6 +62,7 @@ def test_every_name_can_be_imported_and_no_other():
     assert sorted([*homes, "run"]) == undulog.__all__
 
 
+@pytest.mark.slow
 def test_paths_and_open_sessions_give_the_same(runs):
     one = undulog.analyse(runs / "a.mcap")
     with undulog.Session.open(runs / "a.mcap") as session:

@@ -31,6 +31,7 @@ def again(room, output, *words, source="run.mcap", code=0):
     return output
 
 
+@pytest.mark.slow
 def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, capsys):
     path = tmp_path / "a.mcap"
     path.write_text("mine")

@@ -19,7 +19,7 @@ from support.processes import served_page, wait_for
 pytestmark = pytest.mark.slow
 
 WIDTH, HEIGHT = 1440, 900
-SECONDS = 3.0
+SECONDS = 1.0
 # Parts of the window as (top, bottom, left, right) [pixels]. Left out: the title bars, which
 # differ, the lane of modes, whose colours the viewer makes up, and words, which wrap otherwise.
 PARTS = {

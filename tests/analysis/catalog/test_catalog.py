@@ -144,6 +144,7 @@ def test_only_new_and_changed_files_are_read(lab, monkeypatch):
     assert "day1/gait.mcap" in Catalog(str(lab)).find().path.to_list()
 
 
+@pytest.mark.slow
 def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, analysed):
     _, result = analysed
     (lab / "day1" / "gait.json").unlink()

@@ -50,6 +50,7 @@ def test_an_experiment_with_a_bad_file_fails_and_shows_which(folder, command):
     assert [line.split()[0] for line in shown.out.splitlines()] == ["session", "a.mcap", "bad.mcap"]
 
 
+@pytest.mark.slow
 def test_report_into_a_folder_writes_a_page_each_and_an_index(folder, tmp_path, command):
     pages = tmp_path / "pages"
     command("report", folder, "-o", pages, code=1)
@@ -86,6 +87,7 @@ def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
     assert all(after <= before + 1 for before, after in pairwise(levels))
 
 
+@pytest.mark.slow
 def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, command):
     files = folder / "a.mcap", folder / "sub/a.mcap"
     one, each = tmp_path / "one.html", tmp_path / "each.html"

@@ -171,6 +171,7 @@ def test_a_page_is_not_replaced_unasked(write, tmp_path, command):
     assert page.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_groups_by_the_command_line(write, tmp_path, command, report_of):
     a = [write(f"a{k}", 20 + k, late_s=0.1 * k) for k in range(4)]
     b = [write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken) for k in range(4)]

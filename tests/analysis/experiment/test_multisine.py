@@ -75,6 +75,7 @@ def exact_response(found):
     return signal.freqz(*FILTER, worN=hz, fs=RATE_HZ)[1]
 
 
+@pytest.mark.slow
 def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command):
     files = drive(planned("--realisations", 4), tmp_path)
     result = report_of("analyse", *files)

@@ -157,6 +157,7 @@ def result(tmp_path_factory):
     return folder / "kicks.json", files
 
 
+@pytest.mark.slow
 def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, report_of):
     file, sessions = result
     found, direct = (report_of("predict", *one, "--eps", "0.3")["J"] for one in ([file], sessions))

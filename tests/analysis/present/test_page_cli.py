@@ -34,6 +34,7 @@ def test_json_names_page_and_answer_and_the_page_is_the_same(page, recorded, tmp
     assert again.read_bytes() == page.read_bytes()
 
 
+@pytest.mark.slow
 def test_several_sessions_are_one_experiment(both_ways_files, tmp_path, command, report_of):
     page = tmp_path / "both.html"
     files = [str(path) for path in both_ways_files]

@@ -242,6 +242,7 @@ def test_a_ringing_body_mode_is_told_from_the_gait():
     assert sum(low <= 0.2 <= high for low, high in lags) >= 7
 
 
+@pytest.mark.slow
 def test_variation_that_joints_share_counts_once():
     rng = np.random.default_rng(9)
     inside = []

@@ -47,6 +47,7 @@ def test_all_shipped_scenarios_are_here():
     assert {*STEADY, *ADAPTIVE, *AMONG_OBSTACLES} == set(scenario_names())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "engine", "kernels"),
     [

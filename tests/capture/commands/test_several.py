@@ -93,6 +93,7 @@ def test_commands_read_the_bags_of_a_folder(line, bags, report_of, command):
     assert not [row for row in rows if "error" in row]
 
 
+@pytest.mark.slow
 def test_a_report_has_the_bags_of_a_folder(bags, tmp_path, report_of):
     report = report_of("report", bags / "day", "-o", tmp_path / "page.html")
     assert [len(one["sentence"]) > 0 for one in report["answers"]] == [True] * 5

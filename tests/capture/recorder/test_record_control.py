@@ -134,6 +134,7 @@ def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorde
         assert client.ask({"do": "status"})["output"] == f"{place}/run.mcap"
 
 
+@pytest.mark.slow
 def test_a_controller_in_another_process_sends_its_gait_for_a_while(recorder, place, ask):
     """Two seconds of a 100 Hz controller, as fast as it is answered."""
     process = recorder("run")

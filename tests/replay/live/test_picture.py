@@ -89,6 +89,7 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     assert sum(one.is_static for one in static) == 1
 
 
+@pytest.mark.slow
 def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back, opened):
     t_ns = truth.t_ns + np.where(np.arange(len(truth.t_ns)) < 150, 0, 3_000_000_000)
     names = snake25.joint_names

@@ -47,6 +47,7 @@ def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back
         assert drawn.times(entity).tolist() == (truth.t_ns - EPOCH_NS).tolist()
 
 
+@pytest.mark.slow
 def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch):
     monkeypatch.setattr(live_feed, "_DATAGRAM", 4096)
     recorder, relay = stage.recorder(), stage.relay()
@@ -86,6 +87,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
 
 
+@pytest.mark.slow
 def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     stage, snake25, truth, tmp_path, read_back
 ):
@@ -172,6 +174,7 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
         assert sum(len(one.data) for one in taken) <= 150_000
 
 
+@pytest.mark.slow
 def test_spawned_relay_is_in_a_session_of_its_own_and_ends_on_request(stage, tmp_path):
     output = tmp_path / "spawned.rrd"
     relay = spawn_relay(stage.path, ["--save", str(output)])

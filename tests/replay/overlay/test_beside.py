@@ -155,6 +155,7 @@ def beside(files, read_back, tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 def test_every_session_keeps_its_entities_under_its_own_name(
     files, beside, read_back, tmp_path, command
 ):

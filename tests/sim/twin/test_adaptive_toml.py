@@ -78,6 +78,7 @@ def controllers(draw):
     )
 
 
+@pytest.mark.slow
 @given(controllers())
 @settings(max_examples=40, deadline=None)  # each draws the robot from its file
 def test_what_is_written_reads_the_same(controller):

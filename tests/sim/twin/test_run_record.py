@@ -58,6 +58,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_record_states_what_the_scenario_made_of_the_robot(folder):
     robot = parse_scenario(SCENARIO, "changed.toml").robot
     described = load_robot("snake13")

@@ -52,6 +52,7 @@ SIDEWINDING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("planes", "backlash"),
     [(LATERAL, 0.0), (CATERPILLAR, 0.0), (SIDEWINDING, 0.0), (LATERAL, 0.03)],

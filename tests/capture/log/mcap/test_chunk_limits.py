@@ -84,6 +84,7 @@ BOMBS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [True, False])
 def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(tmp_path, whole):
     places = {}

@@ -123,6 +123,7 @@ def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path):
     assert [each.unread for each in health.channels if each.topic == "/odd"] == [1]
 
 
+@pytest.mark.slow
 def test_a_merge_of_more_channels_than_can_be_numbered_is_refused(tmp_path):
     paths = [tmp_path / f"{name}.mcap" for name in ("one", "two")]
     for path in paths:
