@@ -71,7 +71,7 @@ BENCHES = {
     "sweep": Bench("sweep", "", "--runs 100"),
     "fleet": Bench("fleet", "", "--seeds 1"),
     "target-following": Bench("target_following", "", TARGET),
-    "converting": Bench("replay_convert", "--minutes 5", "--minutes 1 --runs 2 --rows 5"),
+    "converting": Bench("replay_convert", "--minutes 5", "--minutes 1 --runs 2 --pairs 2 --rows 5"),
     "merging": Bench("replay_merge", "", "1"),
     "first-picture": Bench("first_picture", "", "1"),
 }  # fmt: skip

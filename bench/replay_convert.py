@@ -4,23 +4,26 @@ The session is that of ``hour_session.py``: 25 joints at 100 Hz, each sampled at
 with currents, voltages, temperatures, 16 distance sensors, odometry and gait, noise and the parts'
 resolution; ``--can`` adds the raw frames, which are read past. It is converted by
 ``write_recording`` in a process of its own, and by ``undulog view --save``, which analyses it
-first. Peak memory is the largest resident set, mapped file included; the file is in the page
-cache, and the best of several runs counts. Processor time, all threads, is printed beside: other
-processes disturb it less.
+first; the two are compared on one core, in turn, ``--pairs`` times. Peak memory is the largest
+resident set, mapped file included; the file is in the page cache, and the best of several runs
+counts. Processor time, all threads, is printed beside: other processes disturb it less.
 
 The peer is what one writes first: every sample of every joint, and every pose of the body, by a
 ``log`` call of its own, on the same two timelines. It takes ``--rows`` seconds of the session, and
 its figures are scaled to the whole, which suits it: nothing in it gets slower with time.
 
-Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--can] [--rows 20]
+Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--pairs 9] [--can] [--rows 20]
      [--folder DIR | --keep FILE]
 """
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -93,6 +96,17 @@ def converted_by_command(session: Path, recording: Path) -> Figures:
     return Figures(*spent, peak_mib * (1 << 20) / 1e6, recording.stat().st_size / 1e6)
 
 
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep what is started to one core."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
 def rerun_itself(path: Path, recording: Path) -> float:
     """Convert the MCAP file by Rerun's own reader; return the processor time [s]."""
     command = [viewer_binary(), "mcap", "convert", path, "-o", recording]
@@ -151,15 +165,17 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> Figures:
     return Figures(*took(log), 0.0, recording.stat().st_size / 1e6)
 
 
-def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
+def measure(path: Path, minutes: float, runs: int, pairs: int, rows_s: float) -> bool:
     """Convert and print; whether all bars are met."""
     recording = path.with_name("bench.rrd")
     print(f"{minutes:g} min, 25 joints at 100 Hz, {path.stat().st_size / 1e6:.0f} MB of MCAP")
     scale = minutes * 60 / rows_s
+    conversion = partial(converted, path, recording)
+    command = partial(converted_by_command, path, recording)
     ours, commands, rows, itself = in_turn(
         runs,
-        partial(converted, path, recording),
-        partial(converted_by_command, path, recording),
+        conversion,
+        command,
         partial(row_by_row, path, rows_s, recording),
         partial(rerun_itself, path, recording),
     )
@@ -174,9 +190,10 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
         compared(what, cpu, itself, own)
         peak_mb = max(one.peak_mb for one in costs)
         good.append(verdict(f"{what}, peak memory", peak_mb, PEAK_MB, "MB"))
-    alone = "the conversion alone"
-    spent = ([one.processor_s for one in costs] for costs in (commands, ours))
-    good.append(compared("view --save, which analyses", *spent, alone, bar=WITH_ANALYSIS))
+    with one_core():
+        spent = in_turn(pairs, lambda: command().processor_s, lambda: conversion().processor_s)
+    what, alone = "view --save, which analyses, on one core", "the conversion alone"
+    good.append(compared(what, *spent, alone, bar=WITH_ANALYSIS))
     verdict("MCAP to .rrd, wall-clock time", min(one.wall_s for one in ours), None, "s")
     sizes = [ours[0].size_mb], [rows[0].size_mb]
     good.append(compared(".rrd, size", *sizes, by_row, bar=SIZE, unit="MB", scale=scale))
@@ -186,13 +203,13 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
 
 def main() -> None:
     """Write, measure, print."""
-    parser = arguments(__doc__, minutes=60.0, runs=2)
+    parser = arguments(__doc__, minutes=60.0, runs=2, pairs=9)
     parser.add_argument("--can", action="store_true", help="with raw frames, 8,000 a second")
     parser.add_argument("--rows", type=float, default=20.0, help="what the peer takes [s]")
     add_place(parser, "2 GB")
     options = parser.parse_args()
     with hour_of(options, can=options.can) as (path, seconds):
-        good = measure(path, seconds / 60, options.runs, options.rows)
+        good = measure(path, seconds / 60, options.runs, options.pairs, options.rows)
     sys.exit(not good)
 
 

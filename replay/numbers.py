@@ -19,7 +19,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from undulog.analysis.present.result_files import load
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.comparison import Comparison, ModelledAnalysis
 from undulog.analysis.results.experiment import Experiment
@@ -156,6 +155,9 @@ def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:
     named: dict[str, list[str]] = {}
     notes: list[str] = []
     for path in paths:
+        # Here, not above: it imports pandas, which an analysis without results doesn't need.
+        from undulog.analysis.present.result_files import load
+
         result = load(path)
         if not isinstance(result, (Analysis, Experiment, Comparison)):
             kind = type(result).__name__
