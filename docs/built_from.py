@@ -1,8 +1,9 @@
 """What the long parts of the manual were built from, as digests in ``built-from.txt``.
 
 ``make pages`` builds each part, then runs ``python docs/built_from.py DATA``, which notes the
-SHA-256 of what determines it: product, locked packages, scripts, and recordings in ``DATA``. A test
-builds a part again only if that has changed since.
+SHA-256 of what determines it: product, locked packages, scripts, and recordings in ``DATA``; and of
+the page itself, so that one edited by hand is found. A test builds a part again only if any of that
+has changed since.
 """
 
 from __future__ import annotations
@@ -16,8 +17,11 @@ ROOT = DOCS.parent
 NOTED = DOCS / "built-from.txt"
 PRODUCT = ("capture", "sim", "analysis", "replay", "undulog", "requirements.lock")
 PARTS = {
-    "real-robots": ("docs/real_robots.py", "docs/real-robots.txt"),
-    "study": ("docs/study", "tests/docs/test_study.py"),
+    "real-robots": (
+        *("docs/real_robots.py", "docs/real-robots.txt", "docs/explanation/real-robots.md"),
+        "tests/docs/test_real_robots.py",
+    ),
+    "study": ("docs/study", "docs/study.md", "tests/docs/test_study.py"),
     "scripts": (*(f"docs/{path.name}" for path in DOCS.glob("*.py")), "tests/docs/test_scripts.py"),
 }
 RECORDINGS = ("so101", "go2", "arcsnake")
