@@ -20,8 +20,9 @@ gives back its energy exactly, k depth^2 / 2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,7 +89,83 @@ _NONE = np.empty((3, 0))
 NO_CONTACT = ObstacleContact(np.empty(0, dtype=np.int64), _NONE, _NONE, _NONE, np.empty(0), _NONE)
 """Nothing touches."""
 
-ObstacleLaw: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], ObstacleContact]
+
+@dataclass(frozen=True, eq=False)
+class ObstacleLaw:
+    """The obstacles' law, ready for one body; see :func:`obstacle_law`."""
+
+    shapes: Sequence[_Round | _Square]
+    material: ObstacleMaterial
+    radius: FloatArray
+    length: FloatArray
+    mass: FloatArray
+    inertia: FloatArray
+    dt: float
+
+    def reachable(self, position: FloatArray, way: float) -> ObstacleLaw:
+        """The same law of those obstacles alone that the links can reach.
+
+        Args:
+            position: Centres of the links [m], shape (3, n).
+            way: How far they move from there, at most [m].
+        """
+        found = [shape.reachable(position[:2, None, :], way) for shape in self.shapes]
+        return replace(self, shapes=[shape for shape in found if shape is not None])
+
+    def __call__(
+        self, position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
+    ) -> ObstacleContact:
+        """The links that touch, and the forces on them; a pure function.
+
+        Args:
+            position: Centres of the links in the world [m], shape (3, n).
+            quaternion: Their orientations x, y, z, w, shape (4, n).
+            velocity: Velocities of the centres [m/s], shape (3, n).
+            spin: Angular velocities in the world [rad/s], shape (3, n).
+        """
+        found = [
+            touch
+            for shape in self.shapes
+            if (touch := self._touching(shape, position, quaternion)) is not None
+        ]
+        if not found:
+            return NO_CONTACT
+        material = self.material
+        link = np.concatenate([touch.link for touch in found])
+        axis = np.concatenate([touch.axis for touch in found], axis=1)
+        normal = np.concatenate([touch.normal for touch in found], axis=1)
+        depth = np.concatenate([touch.depth for touch in found])
+        arm = axis - self.radius[link] * normal
+        at_point = velocity[:, link] + cross(spin[:, link], arm)
+        speed = (normal * at_point).sum(axis=0)
+        press = normal_force(depth, -speed, material.stiffness, material.damping)
+        slip = at_point - speed * normal
+        give = yielding((arm * arm).sum(axis=0), self.mass[link], self.inertia[link])
+        stopped = material.mu * press * self.dt * give
+        smoothed = np.sqrt((slip * slip).sum(axis=0) + material.slip_speed**2 + stopped**2)
+        force = press * (normal - material.mu * slip / smoothed)
+        return ObstacleContact(link, position[:, link] + arm, at_point, normal, depth, force)
+
+    def _touching(
+        self, shape: _Round | _Square, position: FloatArray, quaternion: FloatArray
+    ) -> _Touch | None:
+        """The pairs that touch, with the obstacles of one shape; None where none does."""
+        which, link = np.nonzero(shape.near(position[:2, None, :]))
+        if not len(link):
+            return None
+        half = self.length[link] / 2 * _forward(quaternion[:, link])
+        pair, found = shape.closest(which, position[:2, link], half[:2], self.radius[link])
+        if not len(pair):
+            return None
+        which, link, axis = which[pair], link[pair], found.s * half[:, pair]
+        depth = self.radius[link] - found.distance
+        bottom = position[2, link] + axis[2] - self.radius[link]
+        touch = (depth > 0.0) & (bottom < shape.height[which])
+        if not touch.any():
+            return None
+        normal = np.zeros((3, int(touch.sum())))
+        normal[:2] = found.normal[:, touch]
+        return _Touch(link[touch], axis[:, touch], normal, depth[touch])
 
 
 def obstacle_law(
@@ -101,7 +178,7 @@ def obstacle_law(
     inertia: FloatArray,
     dt: float,
 ) -> ObstacleLaw:
-    """The obstacles' law, ready for one body.
+    """Get the obstacles' law ready for one body.
 
     Args:
         obstacles: What stands in the way.
@@ -110,11 +187,6 @@ def obstacle_law(
         mass: Of the links [kg], shape (n,).
         inertia: Their least principal moments [kg m^2], shape (n,).
         dt: Physics step, 0 for the law without steps [s].
-
-    Returns:
-        A pure function of the links' centres, orientations (x, y, z, w), velocities and angular
-        velocities in the world, of shapes (3, n), (4, n), (3, n), (3, n), to an
-        :class:`ObstacleContact`.
     """
     size = length / 2 + radius  # from the centre of a link to its farthest point
     cylinders, boxes = columns(obstacles)
@@ -122,54 +194,7 @@ def obstacle_law(
         *([_Round(cylinders, size)] if len(cylinders.height) else []),
         *([_Square(boxes, size)] if len(boxes.height) else []),
     ]
-
-    def touching(
-        shape: _Round | _Square, position: FloatArray, quaternion: FloatArray
-    ) -> _Touch | None:
-        """The pairs that touch, with the obstacles of one shape; None where none does."""
-        which, link = np.nonzero(shape.near(position[:2, None, :]))
-        if not len(link):
-            return None
-        half = length[link] / 2 * _forward(quaternion[:, link])
-        pair, found = shape.closest(which, position[:2, link], half[:2], radius[link])
-        if not len(pair):
-            return None
-        which, link, axis = which[pair], link[pair], found.s * half[:, pair]
-        depth = radius[link] - found.distance
-        bottom = position[2, link] + axis[2] - radius[link]
-        touch = (depth > 0.0) & (bottom < shape.height[which])
-        if not touch.any():
-            return None
-        normal = np.zeros((3, int(touch.sum())))
-        normal[:2] = found.normal[:, touch]
-        return _Touch(link[touch], axis[:, touch], normal, depth[touch])
-
-    def contact(
-        position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
-    ) -> ObstacleContact:
-        found = [
-            touch
-            for shape in shapes
-            if (touch := touching(shape, position, quaternion)) is not None
-        ]
-        if not found:
-            return NO_CONTACT
-        link = np.concatenate([touch.link for touch in found])
-        axis = np.concatenate([touch.axis for touch in found], axis=1)
-        normal = np.concatenate([touch.normal for touch in found], axis=1)
-        depth = np.concatenate([touch.depth for touch in found])
-        arm = axis - radius[link] * normal
-        at_point = velocity[:, link] + cross(spin[:, link], arm)
-        speed = (normal * at_point).sum(axis=0)
-        press = normal_force(depth, -speed, material.stiffness, material.damping)
-        slip = at_point - speed * normal
-        give = yielding((arm * arm).sum(axis=0), mass[link], inertia[link])
-        stopped = material.mu * press * dt * give
-        smoothed = np.sqrt((slip * slip).sum(axis=0) + material.slip_speed**2 + stopped**2)
-        force = press * (normal - material.mu * slip / smoothed)
-        return ObstacleContact(link, position[:, link] + arm, at_point, normal, depth, force)
-
-    return contact
+    return ObstacleLaw(shapes, material, radius, length, mass, inertia, dt)
 
 
 def yielding(arm_squared: FloatArray, mass: FloatArray, inertia: FloatArray) -> FloatArray:
@@ -200,14 +225,19 @@ class _Round:
 
     def __init__(self, shapes: Cylinders, size: FloatArray) -> None:
         self.height = shapes.height
-        self._shapes = shapes
+        self._shapes, self._size = shapes, size
         self._centre = shapes.centre[:, :, None]
-        self._reach = (shapes.radius[:, None] + size) ** 2
+        self._reach = shapes.radius[:, None] + size
 
-    def near(self, position: FloatArray) -> BoolArray:
-        """Whether a circle about the link meets the obstacle, shape (o, n)."""
+    def near(self, position: FloatArray, way: float = 0.0) -> BoolArray:
+        """Whether a circle about the link, which moves so far, meets the obstacle, shape (o, n)."""
         x, y = position - self._centre
-        return x * x + y * y < self._reach
+        return x * x + y * y < (self._reach + way) ** 2
+
+    def reachable(self, position: FloatArray, way: float) -> _Round | None:
+        """Those that some link can reach on its way; None for none."""
+        near = np.flatnonzero(self.near(position, way).any(axis=1))
+        return _Round(Cylinders(*_chosen(self._shapes, near)), self._size) if len(near) else None
 
     def closest(
         self, which: IntArray, middle: FloatArray, half: FloatArray, reach: FloatArray
@@ -223,15 +253,20 @@ class _Square:
 
     def __init__(self, shapes: Boxes, size: FloatArray) -> None:
         self.height = shapes.height
-        self._shapes = shapes
+        self._shapes, self._size = shapes, size
         self._centre = shapes.centre[:, :, None]
         self._axis = shapes.axis[:, :, None]
         self._reach = shapes.half[:, :, None] + size
 
-    def near(self, position: FloatArray) -> BoolArray:
-        """Whether a square about the link meets the obstacle, shape (o, n)."""
-        x, y = np.abs(into_axes(self._axis, position - self._centre)) < self._reach
+    def near(self, position: FloatArray, way: float = 0.0) -> BoolArray:
+        """Whether a square about the link, which moves so far, meets the obstacle, shape (o, n)."""
+        x, y = np.abs(into_axes(self._axis, position - self._centre)) < self._reach + way
         return x & y
+
+    def reachable(self, position: FloatArray, way: float) -> _Square | None:
+        """Those that some link can reach on its way; None for none."""
+        near = np.flatnonzero(self.near(position, way).any(axis=1))
+        return _Square(Boxes(*_chosen(self._shapes, near)), self._size) if len(near) else None
 
     def closest(
         self, which: IntArray, middle: FloatArray, half: FloatArray, reach: FloatArray
@@ -247,6 +282,11 @@ class _Square:
             return pair, Closest(reach[:0], reach[:0], middle[:, :0])
         found = to_rectangles(middle[:, pair], half[:, pair], size[:, pair])
         return pair, found._replace(normal=out_of_axes(axis[:, pair], found.normal))
+
+
+def _chosen(shapes: Cylinders | Boxes, which: IntArray) -> Iterator[FloatArray]:
+    """The columns of some shapes alone."""
+    return (column[..., which] for column in shapes)
 
 
 def _forward(quaternion: FloatArray) -> FloatArray:

@@ -32,6 +32,9 @@ from .stability import likely_cause
 MAX_SPEED = 10.0
 """No link of an undulating robot is faster than this [m/s]: beyond it the simulation has failed."""
 
+_MARGIN = 1.5
+"""Speeds are limited by component: in plan view, a link may be sqrt(2) times as fast."""
+
 MAX_ROTOR_SPEED = 1000.0
 """No servo turns faster than this, referred to its joint [rad/s]."""
 
@@ -71,6 +74,7 @@ class Plant:
             if world.obstacles
             else None
         )
+        self._near = self._obstacle_law  # those in reach of the present period
         height = resting_height(scenario)
         start = BodyStart(world.gravity, height, world.heading, world.velocity, self.dt)
         self._engine = engine_type(scenario.engine, kernels)(robot, start)
@@ -116,6 +120,9 @@ class Plant:
         first = self._periods * (len(self._rows) - 1)
         times_s = self.dt * np.arange(first, first + len(self._rows), dtype=np.float64)
         self._period.pushes = pushes_during(self._disturbances, self._link_names, times_s)
+        if self._obstacle_law is not None:  # a faster link ends the run
+            way = MAX_SPEED * (times_s[-1] - times_s[0]) * _MARGIN
+            self._near = self._obstacle_law.reachable(self._rows[0].body.position, way)
         self._periods += 1
         with np.errstate(all="ignore"):  # whoever looks at the steps finds what overflows
             for k in range(1, len(self._rows)):
@@ -141,8 +148,8 @@ class Plant:
     def _look(self, k: int) -> None:
         """Fill in the body, and what obstacles do to it."""
         body = self._engine.read(self._rows[k].body)
-        if self._obstacle_law is not None:
-            self._period.obstacles[k] = self._obstacle_law(*body[:4])
+        if self._near is not None:
+            self._period.obstacles[k] = self._near(*body[:4])
 
 
 def resting_height(scenario: Scenario) -> float:

@@ -36,7 +36,9 @@ def recorded(on, path, env):
         def connected():
             asked = undulog("record", "status", "--json", env=env)
             found = json.loads(asked.stdout or "{}").get("recordings", [])
-            return found and found[0]["sources"][0]["connected"]
+            return any(
+                each["output"] == str(path) and each["sources"][0]["connected"] for each in found
+            )
 
         wait_for(connected, "the recorder", alive=[one])
         yield one

@@ -46,6 +46,28 @@ def test_at_a_distance_nothing_acts():
     assert (len(contact.link), contact.layers(1)) == (0, [])
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_out_of_reach_never_acts(seed):
+    """Obstacles are left out by where links were before they moved; contacts are those of all."""
+    random = np.random.default_rng(seed)
+    scattered = [
+        *(Cylinder(random.uniform(-2, 2, 2), random.uniform(0.02, 0.3), 0.5) for _ in range(20)),
+        *(Box(random.uniform(-2, 2, 2), random.uniform(0.02, 0.5, 2), 0.4, 0.5) for _ in range(20)),
+    ]
+    all_of_them, way, left_out = law(scattered, links=3), 0.15, 0
+    for _ in range(100):
+        position, quaternion, *motion = random_links(random.integers(2**31), links=3)
+        position[:2] += random.uniform(-2, 2, (2, 1))
+        near = all_of_them.reachable(position, way)
+        direction = random.uniform(-np.pi, np.pi, 3)
+        position[:2] += way * random.uniform(0, 1, 3) * [np.cos(direction), np.sin(direction)]
+        found = near(position, quaternion, *motion)
+        for one, other in zip(found, all_of_them(position, quaternion, *motion), strict=True):
+            np.testing.assert_array_equal(one, other)
+        left_out += len(scattered) - sum(len(shape.height) for shape in near.shapes)
+    assert left_out > 0.3 * 100 * len(scattered)
+
+
 @pytest.mark.parametrize(
     ("velocity", "force"),
     # Moving on at 0.05 m/s; and away so fast that the damper would pull.
