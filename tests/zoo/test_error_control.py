@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-SESSIONS = 100
+SESSIONS = 60
 ANY, BROKEN, NAMED = 0.065, 0.01, 0.95
 CHANCE = 1e-3
 """A cell may be off by what chance makes of so few sessions; all cells together may not."""
