@@ -121,6 +121,7 @@ def test_a_closed_pipe_is_no_traceback():
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     trace, session = tmp_path / "trace.mf4", tmp_path / "trace.mcap"

@@ -71,6 +71,7 @@ def test_a_robot_gives_planes_and_metres():
     assert {one.plane for one in motion.waves} == {one.plane for one in motion.joints}
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.floats(-3.0, 3.0),

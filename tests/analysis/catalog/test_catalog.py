@@ -161,6 +161,7 @@ def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, an
     assert catalog.find("path = 'day1/gait.mcap'").status.to_list() == ["not analysed"]
 
 
+@pytest.mark.slow
 def test_a_session_that_can_t_be_analysed_has_its_reason(tmp_path):
     write_foreign(tmp_path / "text.mcap", [("/a", 1, {"data": "x"})], "std_msgs/msg/String")
     (tmp_path / "other").mkdir()

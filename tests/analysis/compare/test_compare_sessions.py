@@ -142,6 +142,7 @@ def test_other_joints_are_left_out_or_refused(write):
         compared(a, write("c", 18, first=11))
 
 
+@pytest.mark.slow
 def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, command):
     page = tmp_path / "page.html"
     files = [str(write("a", 1)), str(write("b", 2, change=weaken))]

@@ -105,6 +105,7 @@ def test_two_noisy_channels_and_the_shared_frequency():
     assert np.mean(trials.omega_inside) > 0.88
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noisy_command", [False, True])
 def test_intervals_hold_in_coloured_noise(noisy_command):
     trials = Trials(seed=13, correlation=0.9, noisy_command=noisy_command)

@@ -122,6 +122,7 @@ def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_p
     assert best["joints"][0]["distortion"]["value"] > 0.02
 
 
+@pytest.mark.slow
 def test_orthogonal_commands_give_the_response_to_each_other_joint(planned, tmp_path, report_of):
     mix = np.array([[1.0, 0.3], [-0.2, 0.8]])
     files = drive(planned("--realisations", 2, "--inputs", "orthogonal"), tmp_path, mix=mix)

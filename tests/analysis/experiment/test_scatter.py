@@ -49,6 +49,7 @@ def test_without_coupling_the_headline_shows_none():
     assert found["headline"] <= 0.05
 
 
+@pytest.mark.slow
 def test_nonlinearity_is_still_found():
     """A servo whose gain falls with amplitude, 14 % nonlinear, under scatter of 0.03 degrees."""
     random = np.random.default_rng(5)

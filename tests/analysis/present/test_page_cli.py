@@ -16,6 +16,7 @@ def page(recorded, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_it_prints_the_answer_and_writes_the_page(page, recorded, command):
     first, second = command("report", recorded, "-o", page, "--force").out.splitlines()
     # Planted lag 7.46 + 6.2 sin(pi place): the middle five joints lie at 1/3, 5/12, 1/2, 7/12, 2/3,

@@ -62,6 +62,7 @@ def test_a_result_that_lacks_a_key_or_has_another_type_is_none(report_of):
     assert len(faults("analysis", result)) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", ["both_ways", "kicked", "swept"])
 def test_an_experiment_of_each_kind(experiment, tmp_path, report_of):
     result = report_of("analyse", *getattr(linear_chain, experiment)(tmp_path))
@@ -74,6 +75,7 @@ def test_a_comparison(tmp_path, report_of):
     assert faults("comparison", report_of("compare", GOLDEN, GOLDEN)) == []
 
 
+@pytest.mark.slow
 def test_a_prediction(tmp_path, report_of):
     runs = linear_chain.kicked(tmp_path)
     assert (

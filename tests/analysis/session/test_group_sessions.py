@@ -64,6 +64,7 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
     )
 
 
+@pytest.mark.slow
 def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, command):
     text = command("analyse", slither).out
     # 3 x 0.954 Hz - 1.432 Hz falls within 1.5/T of 1.432 Hz.
@@ -100,6 +101,7 @@ def runs(folder, *, weak, apart=False):
     return paths
 
 
+@pytest.mark.slow
 def test_the_reversal_takes_all_groups_together(tmp_path):
     result = experiment(runs(tmp_path, weak=0.95 * np.exp(-0.03j)))
     assert result.reversal is not None

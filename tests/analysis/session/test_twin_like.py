@@ -241,6 +241,7 @@ def test_the_first_line_is_the_answer_and_the_last_the_method(twin, command):
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])
 
 
+@pytest.mark.slow
 def test_files_and_options_of_the_verb(twin, tmp_path, command):
     out = tmp_path / "result.json"
     assert f"Result: {out}" in command("analyse", twin, twin, "-o", out).out

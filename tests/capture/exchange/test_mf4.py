@@ -204,6 +204,7 @@ def test_files_that_hold_no_frames(tmp_path):
         read(path)
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path, capfd, monkeypatch):
     """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
     messages = []

@@ -222,6 +222,7 @@ def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, path, lef
         assert session.session_id == "killed"
 
 
+@pytest.mark.slow
 def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
     """Power is lost: of the file's last chunks, which were not synced, only some is there."""
     unfinished(path, 4000, segment_size=8 << 20)  # nothing released
@@ -235,6 +236,7 @@ def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
         assert any("none is missing" in text for text in warnings)
 
 
+@pytest.mark.slow
 def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(path):
     unfinished(path, 8000, segment_size=16 << 20)
     whole = path.read_bytes()

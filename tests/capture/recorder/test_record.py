@@ -75,6 +75,7 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
         assert np.isin(device_ns, frames["t_device_ns"]).all()
 
 
+@pytest.mark.slow
 def test_unknown_identifiers_and_losses_are_reported_and_the_verdict_is_that_of_a_check(
     output, bus
 ):
@@ -94,6 +95,7 @@ def test_unknown_identifiers_and_losses_are_reported_and_the_verdict_is_that_of_
     assert (frames_of(output)["id_flags"] == 0x7AB).sum() == unknown
 
 
+@pytest.mark.slow
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     options = ("--fast", "--duration", "4s", "--json", "--floor", "0")
@@ -120,6 +122,7 @@ def test_a_signal_leaves_a_whole_file(number, tmp_path, output, bus):
     assert check_session(output).file.indexed
 
 
+@pytest.mark.slow
 def test_a_mistake_in_what_looks_on_does_not_end_the_recording(output, bus, monkeypatch):
     def fails(self, now_ns):
         raise ZeroDivisionError(f"at {now_ns}")

@@ -39,6 +39,7 @@ def polling():
 ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
 def test_an_impossible_device_time_ends_no_decoding(first, tmp_path):
     bus, frames = tmp_path / "bus.sock", polling()
@@ -167,6 +168,7 @@ def test_a_decoder_that_always_fails_ends_in_bounded_time(tmp_path, monkeypatch)
 # -- simulated time and plug-ins ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_duration_ends_sources_of_simulated_time(tmp_path):
     bus = tmp_path / "bus.sock"
     words = (f"can0=unix:{bus}?clock=simulated", "--duration", "1.5")

@@ -105,6 +105,7 @@ def check_kill(command, folder, path, accepted):
     return files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
 def test_a_killed_recording_has_what_was_accepted(options, tmp_path, command, cycle):
     check_kill(command, tmp_path, *record_and_kill(cycle, tmp_path, 0, *options))

@@ -119,6 +119,7 @@ def test_the_intervals_are_the_device_s_and_no_stamp_is_repeated():
     assert np.diff(made.host).std() > 20 * (steps - np.diff(made.true))[settled].std()
 
 
+@pytest.mark.slow
 def test_an_hour_of_a_quartz_in_the_sun_is_followed():
     """The rate wanders by 20 ppm within the hour; memory holds one minute of it."""
     rng = np.random.default_rng(5)
@@ -303,6 +304,7 @@ def test_samples_of_longer_ways_keep_their_times_among_the_others(drift_ppm):
     assert clock.result().resets == 0
 
 
+@pytest.mark.slow
 @given(
     *(st.floats(-150, 150), st.floats(1e-4, 5e-3), st.floats(0, 2e-3)),
     *(st.integers(0, 2**62 - 10**12), st.integers(0, 99)),

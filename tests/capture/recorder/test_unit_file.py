@@ -184,6 +184,7 @@ def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(servi
     assert not (tmp_path / "runtime" / "run.sock").exists()
 
 
+@pytest.mark.slow
 def test_a_loop_that_hangs_feeds_its_watchdog_no_more(service):
     process, manager = service()
     heard(manager, "READY=1")

@@ -85,6 +85,7 @@ def hold_the_interpreter(seconds):
     assert took >= seconds
 
 
+@pytest.mark.slow
 def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
     """An AF_UNIX socket of the default size holds 277 such packets."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:

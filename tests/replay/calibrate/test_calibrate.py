@@ -68,6 +68,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
+@pytest.mark.slow
 def test_a_dead_time_is_reported_and_not_written(small, tmp_path, report_of):
     late_s = 0.012
     late_ns = round(late_s * 1e9)

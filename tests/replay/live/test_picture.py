@@ -25,6 +25,7 @@ def replay(session_file, tmp_path_factory, read_back):
     return read_back(path)
 
 
+@pytest.mark.slow
 def test_every_message_is_shown(live, session_file, opened):
     report, _ = live
     count = sum(channel.count for channel in opened(session_file).channels.values())

@@ -17,6 +17,7 @@ from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
 from undulog.replay.live.relay import Inbox
 
 
+@pytest.mark.slow
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
     recorder = stage.recorder()
     recorder.send(0.0, 1.5, wait=False)
@@ -33,6 +34,7 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
 
+@pytest.mark.slow
 def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back):
     recorder, relay = stage.recorder(), stage.relay()
     recorder.connect()
@@ -193,6 +195,7 @@ def test_spawned_relay_is_in_a_session_of_its_own_and_ends_on_request(stage, tmp
     assert output.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_spawned_relay_says_why_it_ended(tmp_path):
     relay = spawn_relay(tmp_path / "there is no such folder" / "s", ["--connect", "x"])
     try:
@@ -203,6 +206,7 @@ def test_spawned_relay_says_why_it_ended(tmp_path):
         relay.close()
 
 
+@pytest.mark.slow
 def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
     monkeypatch.setattr("undulog.capture.recorder.live_feed._GRACE_S", 0.2)
     relay = spawn_relay(stage.path, ["--connect", "rerun+http://127.0.0.1:9/proxy"])

@@ -248,6 +248,7 @@ def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(besid
 BAR_VALUES = "BarChart:values"
 
 
+@pytest.mark.slow
 def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid, opened):
     slow = Wave(amplitude=0.36, delay=0.2)
     files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
@@ -304,6 +305,7 @@ def test_a_phase_is_found_where_it_was_first_reached():
     np.testing.assert_allclose(found[known] * 1e-9, np.array(expected)[known], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, report_of):
     bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
     for pair in ((files[0], bare), (bare, files[0])):

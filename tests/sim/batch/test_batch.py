@@ -75,6 +75,7 @@ def short(scenario, joints):
     return dataclasses.replace(scenario, robot=robot)
 
 
+@pytest.mark.slow
 def test_angles_are_those_of_the_twin_on_mujoco_under_every_law(weak):
     scenarios = [
         with_law(short(weak, joints), law) for law in LAWS for joints in (5, len(weak.robot.joints))
@@ -135,6 +136,7 @@ def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
         assert getattr(run, name)[: len(expected)] == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_every_open_loop_scenario_without_a_lateral_instability_is_the_twins():
     # Those in the vertical plane alone are unstable sideways: rounding decides when they leave it.
     names = [

@@ -133,6 +133,7 @@ def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, command, opened):
     assert opened(again).attachments["plan.toml"].decode() == PLAN
 
 
+@pytest.mark.slow
 def test_several_motions_are_driven_into_a_folder(plain, tmp_path, command, report_of):
     """Each under its own name, the same as alone; a table says what came of each."""
     folder, alone = tmp_path / "driven", tmp_path / "alone.mcap"
@@ -187,6 +188,7 @@ def test_a_gait_can_be_driven_in_another_world(tmp_path, command):
     assert "no scenario 'nowhere'" in command(*words, code=2).err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     path = tmp_path / "stopped.mcap"

@@ -142,6 +142,7 @@ class Controller:
         return GaitTick(command, np.empty(0), "test", ())
 
 
+@pytest.mark.slow
 def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario, robot, running):
     truth = [sample.position for sample in sensed(scenario, Controller())]
     live = running(scenario, lockstep=True)

@@ -242,6 +242,7 @@ def test_answers_are_those_of_the_protocol(serving):
     )
 
 
+@pytest.mark.slow
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
     own = traffic(1000, 0)
     with hand(serving, b"open can0", b"rawmode"), peer(serving) as good:

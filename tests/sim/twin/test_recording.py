@@ -230,6 +230,7 @@ def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, 
     np.testing.assert_array_equal(energy, [sample.energy for sample in truth])
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         # Another hash seed and another time zone must not matter either.

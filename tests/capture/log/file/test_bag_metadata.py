@@ -53,6 +53,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(tree=st.dictionaries(st.text(max_size=20) | st.just(KEY), VALUES, max_size=4))
 def test_written_yaml_is_seen_as_it_is_read(tree, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bag")

@@ -263,6 +263,7 @@ def test_mutated_summaries_never_read_otherwise_than_here(chunked, tmp_path):
     assert sum(outcomes) > 20
 
 
+@pytest.mark.slow
 def test_a_url_opens_as_a_stream(session):
     data = session.read_bytes()
     with web_server(files={"run.mcap": data}) as server:

@@ -15,6 +15,7 @@ RECORDS = st.integers(0, 300).flatmap(
 )
 
 
+@pytest.mark.slow
 @given(RECORDS)
 def test_the_bytes_are_those_of_the_general_encoder(data):
     count, size = len(data) // 32, len(data)

@@ -35,6 +35,7 @@ print("read")
 """
 
 
+@pytest.mark.slow
 def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path):
     topics = {"/joint_states": (("a", "b"), "rad", np.zeros((100, 2)))}
     t_ns = EPOCH_NS + np.arange(100) * 10_000_000

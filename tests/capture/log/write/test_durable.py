@@ -273,6 +273,7 @@ def test_a_full_disk_ends_in_a_file_with_all_that_was_accepted(small_disk, split
         assert (small_disk / "run_0002.mcap").exists()
 
 
+@pytest.mark.slow
 def test_a_disk_too_full_to_finalise_keeps_all_in_the_write_ahead_log(small_disk):
     accepted, end = fill(small_disk, 0, hog="late")
     found, warnings = read(small_disk / "run.mcap")
