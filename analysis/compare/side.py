@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.strict_table import read_toml
 
@@ -73,15 +73,21 @@ def cycles_by_phase(
     rest = one.values - fit.predict(channel, one.t_s)
     left = Series(one.name, one.t_s, rest).at(times.ravel()).reshape(times.shape)
     cut = fit.predict(channel, times) + left
-    return cut[[_whole(one, start, start + cycle_s) for start in starts.tolist()]]
+    return cut[_whole(one, starts, starts + cycle_s)]
 
 
-def _whole(one: Series, start_s: float, stop_s: float) -> bool:
-    """Return whether samples cover a cycle without a gap."""
-    longest = GAP_FACTOR * one.period_s
-    inside = one.between(start_s, stop_s).t_s
-    edges = np.concatenate([[start_s], inside, [stop_s]])
-    return inside.size > 1 and bool(np.max(np.diff(edges)) <= longest)
+def _whole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> BoolArray:
+    """Return which of c cycles samples cover without a gap, shape (c,)."""
+    first, last = one.rows_from(start_s), one.rows_from(stop_s) - 1
+    whole = last > first
+    i, j, t_s, longest = first[whole], last[whole], one.t_s, GAP_FACTOR * one.period_s
+    gaps = np.append(0, np.cumsum(np.diff(t_s) > longest))  # before each sample
+    whole[whole] = (
+        (t_s[i] - start_s[whole] <= longest)
+        & (stop_s[whole] - t_s[j] <= longest)
+        & (gaps[i] == gaps[j])
+    )
+    return whole
 
 
 _OF_THE_RUN = frozenset(

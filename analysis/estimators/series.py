@@ -74,11 +74,15 @@ class Series:
             Views of the samples with ``start_s <= t < stop_s``; counts of dropped samples stay
             those of the whole.
         """
-        limits = np.array([start_s, stop_s]) - _HALF_NS  # times are whole ns but for rounding
-        i, j = np.searchsorted(self.t_s, limits, side="left")
+        i, j = self.rows_from(np.array([start_s, stop_s]))
         return Series(
             self.name, self.t_s[i:j], self.values[i:j], self.dropped_nan, self.dropped_duplicates
         )
+
+    def rows_from(self, t_s: FloatArray) -> IntArray:
+        """Return the first row at each of some times or later; the number of rows for none."""
+        # Times are whole ns but for rounding.
+        return np.searchsorted(self.t_s, t_s - _HALF_NS, side="left")
 
 
 def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Series:

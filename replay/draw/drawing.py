@@ -31,7 +31,7 @@ from ..samples.tracks import Track, drawn_topics, read_columns
 from . import lines
 from .body import Look, body_title
 from .heat_maps import heat_maps, log_maps
-from .mean_cycle import log_mean_cycle, read_averaged
+from .mean_cycle import Averaged, log_mean_cycle
 from .motion import BODY_RATE_HZ, HeadPath, read_head
 from .plots import Plots, log_others, log_words
 from .stage import Scene
@@ -242,16 +242,20 @@ class Drawing:
         named: Sequence[Named] = (),
         *,
         span: Span = _WHOLE,
+        averaged: Averaged | None = None,
     ) -> None:
         """Write styles and static entities.
 
         Args:
             named: Modules that tests name, to be marked.
+            averaged: Keeps what the mean cycle needs of all stretches, where the analysis is known
+                before; else it is read again.
             span: The part of the session that is at hand: the body's path is read and drawn no
                 further before :meth:`widen`.
         """
         self._rec, self._clock, self._sources = rec, clock, sources
         self._named = [one.joint for one in named]
+        self._averaged = averaged
         robot = sources.session.robot
         moving = sources.measured or sources.commanded
         self._palette = palette_of(robot, [track.name for track in moving])
@@ -272,6 +276,8 @@ class Drawing:
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch."""
         span = stretch.span
+        if self._averaged is not None:
+            self._averaged.keep(stretch)
         self._plots.write(
             quantities(stretch.columns), lambda _, t_ns: span.rows(t_ns), span.known_ns
         )
@@ -327,10 +333,14 @@ class Drawing:
         analysis, sources = layer.analysis, self._sources
         tables = cycle_tables(analysis, layer.steady) if analysis is not None else ()
         cycles = log_cycles(self._rec, self._clock, tables, self._palette)
+        if self._averaged is None:
+            averaged = Averaged(self._clock, analysis).read(sources.session, sources.found.wanted)
+        else:
+            averaged = self._averaged.kept
         mean = log_mean_cycle(
             self._rec,
             self._clock,
-            read_averaged(sources.session, sources.found.wanted, self._clock, analysis),
+            averaged,
             self._look(self.limit_w),
             analysis=analysis,
             warnings=sources.warnings,

@@ -22,8 +22,8 @@ from undulog.capture.robot.model import Robot
 
 from ..samples.content import GREY, Color, MeanCycle, Series, line_title
 from ..samples.quantities import mechanical_power, segment_power
-from ..samples.timeline import ENSEMBLE_CYCLE, Clock
-from ..samples.tracks import Columns, read_columns
+from ..samples.timeline import ENSEMBLE_CYCLE, Clock, Span, Stretch
+from ..samples.tracks import Columns, Track, read_columns
 from .body import Look, capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 from .lines import log_look
@@ -42,25 +42,60 @@ _WHITE = (255, 255, 255, 255)
 _FAINT = 110  # opacity of the lines at the ends of an interval
 
 
-def read_averaged(
-    session: SessionView,
-    wanted: Mapping[str, Sequence[str]],
-    clock: Clock,
-    analysis: Analysis | None,
-) -> Columns:
-    """Read what is averaged: at most :data:`MOST_S` from the start of the analysed window on.
+class Averaged:
+    """Samples that are averaged: at most :data:`MOST_S` from the start of the analysed window on.
 
-    Args:
-        wanted: JointState topic to the fields that come.
-        analysis: The session's analysis, or None.
+    They are kept from the stretches that are drawn, or else read.
     """
-    windows = () if analysis is None else analysis.gait.windows
-    start_ns = clock.start_ns + round(windows[0].start_s * 1e9) if windows else clock.start_ns
-    drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
-    stop_ns = start_ns + round(MOST_S * 1e9)
-    columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
-    session.forget()
-    return columns
+
+    def __init__(self, clock: Clock, analysis: Analysis | None) -> None:
+        """Keep nothing by now.
+
+        Args:
+            analysis: The session's analysis, or None.
+        """
+        windows = () if analysis is None else analysis.gait.windows
+        late_ns = round(windows[0].start_s * 1e9) if windows else 0
+        start_ns = clock.start_ns + late_ns
+        self._window = Span(start_ns, start_ns + round(MOST_S * 1e9))
+        self._kept: dict[tuple[str, str], dict[str, list[Track]]] = {}
+
+    def keep(self, stretch: Stretch) -> None:
+        """Keep copies of what is averaged of the samples in a stretch's span."""
+        for key, tracks in stretch.columns.items():
+            for track in tracks if key[0] in _TOPICS else ():
+                own, wanted = (one.rows(track.t_ns) for one in (stretch.span, self._window))
+                rows = slice(max(own.start, wanted.start), min(own.stop, wanted.stop))
+                if rows.start < rows.stop:
+                    part = Track(track.name, track.t_ns[rows].copy(), track.values[rows].copy())
+                    self._kept.setdefault(key, {}).setdefault(track.name, []).append(part)
+
+    @property
+    def kept(self) -> Columns:
+        """All samples that were kept."""
+        return {
+            key: tuple(
+                Track(
+                    name,
+                    np.concatenate([part.t_ns for part in parts]),
+                    np.concatenate([part.values for part in parts]),
+                )
+                for name, parts in tracks.items()
+            )
+            for key, tracks in self._kept.items()
+        }
+
+    def read(self, session: SessionView, wanted: Mapping[str, Sequence[str]]) -> Columns:
+        """Read them.
+
+        Args:
+            wanted: JointState topic to the fields that come.
+        """
+        drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
+        start_ns, stop_ns = self._window.start_ns, self._window.stop_ns
+        columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
+        session.forget()
+        return columns
 
 
 def log_mean_cycle(
@@ -75,7 +110,7 @@ def log_mean_cycle(
     """Average the cycles and draw the mean.
 
     Args:
-        columns: From :func:`read_averaged`.
+        columns: From :class:`Averaged`.
         clock: The session's timelines; their rhythm is the phase, where one was logged.
         analysis: The session's analysis, for its window and what is wrong with samples, or None.
         warnings: Grows by a sentence where joints are left out.
