@@ -52,6 +52,21 @@ def alone(tmp_path):
     return os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
 
 
+def driven(*words, env):
+    """Drive to the end, and return the report.
+
+    The gate rightly ends a drive if this computer stands still for 30 ms, as it does now and then
+    where others use it too; that is not what these tests are about, so it may do so twice.
+    """
+    for _ in range(3):
+        done = undulog("drive", *words, "--force", "--json", env=env)
+        report = json.loads(done.stdout)
+        if (report["fault"] or {}).get("kind") not in ("late", "silent"):
+            break
+    assert (done.returncode, done.stderr, report["outcome"]) == (0, "", "complete")
+    return report
+
+
 def test_a_recorder_gets_the_gait_through_its_control_socket(tmp_path, alone):
     path = tmp_path / "recorded.mcap"
     with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
@@ -96,11 +111,8 @@ def held_back(wanted, most=4.0 * 0.01):
 def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, alone):
     path = tmp_path / "a.mcap"
     with served("flat", "--duration", "60") as (on, _):
-        words = ("drive", "flat", "--on", f"{on}&plain=yes", "--arm", "--duration", "1")
-        drove = undulog(*words, "-o", str(path), "--json", env=alone)
-    assert (drove.returncode, drove.stderr) == (0, "")
-    report = json.loads(drove.stdout)
-    assert report["outcome"] == "complete"
+        words = ("flat", "--on", f"{on}&plain=yes", "--arm", "--duration", "1")
+        report = driven(*words, "-o", str(path), env=alone)
     assert report["approach_s"] >= 0.5  # whose bus it is has to be read from it
     assert report["lateness"]["ticks"] >= 100
     with Session.open(path) as session:
@@ -117,14 +129,11 @@ def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
         recorded(on, first, alone),
         recorded(on, second, alone),
     ):
-        words = ("drive", "flat", "--on", on, "--arm", "-o", str(tmp_path / "c.mcap"))
-        drove = undulog(*words, "--duration", "0.2", env=alone, code=2)
+        words = ("flat", "--on", on, "--arm", "--duration", "0.2", "-o", str(tmp_path / "c.mcap"))
+        drove = undulog("drive", *words, env=alone, code=2)
         assert "2 recorders run; which one is to receive the gait?" in drove.stderr
         sockets = [line.split()[-1] for line in drove.stderr.splitlines()[1:]]
-        chosen = undulog(
-            *(*words, "--duration", "0.2", "--recorder", sockets[1], "--json"), env=alone, code=0
-        )
-        assert json.loads(chosen.stdout)["recorder"] == sockets[1]
+        assert driven(*words, "--recorder", sockets[1], env=alone)["recorder"] == sockets[1]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
