@@ -80,7 +80,14 @@ class Series:
         )
 
     def rows_from(self, t_s: FloatArray) -> IntArray:
-        """Return the first row at each of some times or later; the number of rows for none."""
+        """Return the first row at each of some times or later.
+
+        Args:
+            t_s: Times [s], shape (k,).
+
+        Returns:
+            Indices, n where no sample is so late, shape (k,).
+        """
         # Times are whole ns but for rounding.
         return np.searchsorted(self.t_s, t_s - _HALF_NS, side="left")
 

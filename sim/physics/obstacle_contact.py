@@ -92,7 +92,16 @@ NO_CONTACT = ObstacleContact(np.empty(0, dtype=np.int64), _NONE, _NONE, _NONE, n
 
 @dataclass(frozen=True, eq=False)
 class ObstacleLaw:
-    """The obstacles' law, ready for one body; see :func:`obstacle_law`."""
+    """The obstacles' law, ready for one body by :func:`obstacle_law`.
+
+    Attributes:
+        shapes: What stands in the way, by shape.
+        radius: Radii of the n links [m], shape (n,).
+        length: Lengths of the links, joint to joint [m], shape (n,).
+        mass: Of the links [kg], shape (n,).
+        inertia: Their least principal moments [kg m^2], shape (n,).
+        dt: Physics step, 0 for the law without steps [s].
+    """
 
     shapes: Sequence[_Round | _Square]
     material: ObstacleMaterial

@@ -24,6 +24,7 @@ LONGEST_S = 30.0
 """By then the random walk has met a wall; the docs' script runs all of every scenario."""
 
 STEADY_S = 10.0
+"""Steady gaits are over their start by then, the slowest of them for three cycles."""
 
 
 def analysed(name, folder, longest_s=LONGEST_S):

@@ -13,9 +13,12 @@ from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
 from undulog.capture import Session
+from undulog.replay.draw.drawing import Sources, clock_of
+from undulog.replay.draw.mean_cycle import Averaged
 from undulog.replay.draw.steps import cycle_tables
 from undulog.replay.numbers import computed
 from undulog.replay.recording import write_recording
+from undulog.replay.samples import timeline
 from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
 
@@ -147,3 +150,25 @@ def test_joints_with_a_false_sensor_are_left_out(
     assert any("the mean cycle leaves out joint09" in note for note in written.warnings)
     shapes = read_back(tmp_path / "a.rrd").column("/ensemble/body/measured", "Capsules3D:radii")
     assert {len(row) for row in shapes} == {9}  # the links before the joint
+
+
+def test_what_was_kept_stretch_by_stretch_is_what_is_read_at_once(twin, monkeypatch):
+    monkeypatch.setattr(timeline, "STRETCH_NS", 10**9)
+    with Session.open(twin[0]) as session:
+        analysis, sources, clock = (
+            computed(session).analysis,
+            Sources.of(session),
+            clock_of(session),
+        )
+        averaged, wanted = Averaged(clock, analysis), sources.found.wanted
+        stretches = list(timeline.stretches(session, wanted, sources.found.context_ns))
+        for stretch in stretches:
+            averaged.keep(stretch)
+        kept, read = averaged.kept, averaged.read(session, wanted)
+    assert len(stretches) > 3
+    assert kept.keys() == read.keys()
+    for key in read:
+        for one, other in zip(kept[key], read[key], strict=True):
+            assert one.name == other.name
+            np.testing.assert_array_equal(one.t_ns, other.t_ns)
+            np.testing.assert_array_equal(one.values, other.values)

@@ -60,6 +60,7 @@ def driven(*words, env):
     """
     for _ in range(3):
         done = undulog("drive", *words, "--force", "--json", env=env)
+        assert done.stdout, done.stderr
         report = json.loads(done.stdout)
         if (report["fault"] or {}).get("kind") not in ("late", "silent"):
             break
