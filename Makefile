@@ -13,8 +13,8 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures pages golden lock \
-  release install-paths clean
+.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures pages \
+  pages-scripts pages-tables golden lock release install-paths clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -107,8 +107,15 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 DATA ?= ../shared/data
 pages: $(READY)  ## what takes long in the manual: real robots (DATA=FOLDER with recordings), study, tables
 	$(BIN)/python docs/real_robots.py $(DATA)
-	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -m slow tests/docs/test_study.py tests/docs/test_scripts.py
+	$(MAKE) -j2 --output-sync=target pages-scripts pages-tables
 	$(BIN)/python docs/built_from.py $(DATA)
+
+pages-scripts: $(READY)
+	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -p no:cacheprovider -m built tests/docs \
+	  --ignore=tests/docs/test_real_robots.py
+
+pages-tables: $(READY)
+	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -p no:cacheprovider -m built tests --ignore=tests/docs
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py

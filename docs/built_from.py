@@ -3,7 +3,8 @@
 ``make pages`` builds each part, then runs ``python docs/built_from.py DATA``, which notes the
 SHA-256 of what determines it: product, locked packages, scripts, and recordings in ``DATA``; and of
 the page itself, so that one edited by hand is found. A test builds a part again only if any of that
-has changed since.
+has changed since. ``tables`` are long tests that hold what the manual's tables say, with fewer
+draws: a file of tests is among their inputs if it marks one ``built("tables")``.
 """
 
 from __future__ import annotations
@@ -16,13 +17,30 @@ DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 NOTED = DOCS / "built-from.txt"
 PRODUCT = ("capture", "sim", "analysis", "replay", "undulog", "requirements.lock")
+SCRIPTS = [f"docs/{path.name}" for path in DOCS.glob("*.py")]
+
+
+def _marked(part: str) -> list[str]:
+    """Return the files that mark a test as one of a part."""
+    mark = f'mark.built("{part}")'
+    files = (ROOT / "tests").rglob("test_*.py")
+    return [str(path.relative_to(ROOT)) for path in files if mark in path.read_text()]
+
+
 PARTS = {
     "real-robots": (
         *("docs/real_robots.py", "docs/real-robots.txt", "docs/explanation/real-robots.md"),
         "tests/docs/test_real_robots.py",
     ),
     "study": ("docs/study", "docs/study.md", "tests/docs/test_study.py"),
-    "scripts": (*(f"docs/{path.name}" for path in DOCS.glob("*.py")), "tests/docs/test_scripts.py"),
+    "scripts": (*SCRIPTS, "tests/docs/test_scripts.py"),
+    "tables": (
+        *SCRIPTS,
+        "bench/target_following.py",
+        "tests/support",
+        "tests/zoo",
+        *_marked("tables"),
+    ),
 }
 RECORDINGS = ("so101", "go2", "arcsnake")
 

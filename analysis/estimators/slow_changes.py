@@ -66,6 +66,7 @@ _ENOUGH = 8  # points that a fine grid spreads over
 _LEAST_WEIGHT = 1e-3
 _OUT_OF_REACH = 1e9  # a transient as long as the window has no known end
 _TINY = 1e-300
+_CACHED = 32_768  # numbers
 
 
 @dataclass(frozen=True)
@@ -237,8 +238,12 @@ def _fit(shapes: Shapes, noise: _Noise, series: FloatArray) -> _Fits:
     q, r = np.linalg.qr(noise.whiten @ shapes.designs)
     inverse = np.linalg.inv(r)
     turned = np.swapaxes(q, 1, 2) @ right
-    squares = [np.sum((right - a @ b) ** 2, axis=0) for a, b in zip(q, turned, strict=True)]
-    rss = np.maximum(np.stack(squares), _TINY)
+    rss = np.empty((len(q), k))
+    for some in _parts(len(q), right.size):
+        rest = q[some] @ turned[some]
+        rest -= right
+        np.einsum("sck,sck->sk", rest, rest, out=rss[some])
+    np.maximum(rss, _TINY, out=rss)
     logs = np.log(rss).reshape(-1, 2, k // 2).sum(axis=2)
     information = 2 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
     # Over |X' X|, or it would depend on the scale of the columns.
@@ -251,6 +256,13 @@ def _fit(shapes: Shapes, noise: _Noise, series: FloatArray) -> _Fits:
         restricted=-0.5 * (k / 2 * information + (n - p) * logs),
         full=-0.5 * (k * noise.log_det + n * logs.sum(axis=1)),
     )
+
+
+def _parts(trends: int, size: int) -> Iterator[slice]:
+    """Yield slices of so many trends that their residuals stay in the processor's cache."""
+    step = max(1, _CACHED // size)
+    for start in range(0, trends, step):
+        yield slice(start, start + step)
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ def test_a_missing_argument_exits_2(command):
     assert "FILE" in command("log", "info", code=2).err
 
 
+@pytest.mark.slow
 def test_a_missing_extra_is_named():
     # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
     code = (
@@ -139,6 +140,7 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
     assert "5 CAN frames" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "info --json", "sim list"])
 def test_a_full_device_behind_the_output_is_an_error(words):
     with Path("/dev/full").open("w") as full:

@@ -83,6 +83,7 @@ def test_a_tree_without_links_is_refused_when_it_is_built(tree, tmp_path):
     assert "symbolic link" in err
 
 
+@pytest.mark.slow
 def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(wheel, tmp_path):
     place, work = tmp_path / "site", tmp_path / "work"
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--quiet"]

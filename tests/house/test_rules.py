@@ -2,6 +2,8 @@
 
 import sys
 
+import pytest
+
 from support.paths import ROOT
 from support.processes import run, tracked
 
@@ -19,6 +21,7 @@ def test_no_recording_or_output_is_tracked_but_those_that_tests_are_held_to():
     assert recordings == ["tests/replay/golden/session.mcap"]
 
 
+@pytest.mark.slow
 def test_every_bench_finds_what_it_imports():
     names = sorted(path.stem for path in (ROOT / "bench").glob("*.py"))
     assert "twin_step" in names

@@ -161,6 +161,7 @@ def test_json_is_one_value_and_keeps_the_names(run, command):
         assert set(value["attachments"]) == {f"a\x1b]52;c;cm0gLXJmIC8=\x07\n{FORGED}"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["analyse A", "compare A B", "log export A -o pty.csv"])
 def test_a_terminal_gets_styles_and_progress_only(folder, command):
     (folder / "pty.csv").unlink(missing_ok=True)

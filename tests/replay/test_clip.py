@@ -89,6 +89,7 @@ class TestFiles:
         assert np.abs(np.array(frames[7].getpixel((45, 50))) - VERMILION).max() <= 8
         assert np.abs(np.array(frames[7].getpixel((5, 5))) - GROUND).max() <= 8
 
+    @pytest.mark.slow
     def test_chromium_plays_the_mp4(self, tmp_path, browser):
         squares(tmp_path / "a", kind=".mp4", fps=10)
         facts, frame = played(browser, tmp_path / "a", 1.25)

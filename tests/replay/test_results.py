@@ -129,6 +129,7 @@ def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analy
     assert names_and_reasons(layer) == [("joint09", why)]
 
 
+@pytest.mark.slow
 def test_with_a_comparison_alone_the_session_is_analysed(session, comparison, tmp_path):
     layer = saved(session, [comparison.save(tmp_path / "two.json")])
     assert layer.analysis is not None
@@ -157,6 +158,7 @@ def marked(session_file, results, tmp_path, read_back, command):
     return read_back(tmp_path / "a.rrd")
 
 
+@pytest.mark.slow
 def test_named_modules_are_marked_on_the_body(marked, recording, snake25, truth):
     assert not any("named" in path for path in recording[1].entities)  # without results
     assert marked.column("/world/snake/named", "Points3D:labels")[0] == ["joint05"]

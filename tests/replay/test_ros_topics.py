@@ -10,6 +10,7 @@ def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp("control") / "bag", filling(Filler.controller))
 
 
+@pytest.mark.slow
 def test_a_view_shows_the_joints_of_a_controller(bag, tmp_path, report_of):
     written = report_of("view", bag, "--save", tmp_path / "a.rrd")
     assert written["joints"] == list(NAMES)

@@ -202,6 +202,7 @@ def test_a_viewer_that_dies_is_reported(long_file, tmp_path):
             progressive.show_session(task_of(Killing()), viewer, StopRequest())
 
 
+@pytest.mark.slow
 def test_an_analysis_that_dies_is_a_note(tmp_path):
     with Analysing(tmp_path / "gone.mcap", TOPICS) as analysing:
         analysing.start()

@@ -15,6 +15,7 @@ def too_often(share, sessions, bar):
     return round(share * sessions) > binom.ppf(1 - CHANCE, sessions, bar)
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 def test_identical_joints_are_rarely_reported_to_differ():
     cells = answer_tables.identical(SESSIONS)
@@ -26,6 +27,7 @@ def test_identical_joints_are_rarely_reported_to_differ():
     assert np.mean([shares[1] for shares in cells.values()]) <= BROKEN
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 def test_a_joint_off_by_three_half_widths_is_named():
     sessions = SESSIONS // 4

@@ -91,6 +91,7 @@ def test_joints_that_do_not_follow_are_detected():
     assert not wrong, wrong
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 def test_every_output_is_right_about_every_fault():
     """A seed a fault, through bags; `make zoo` takes a hundred."""

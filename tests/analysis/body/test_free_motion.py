@@ -92,6 +92,7 @@ def test_order_and_time_turn_a_wave_round(step, sizes, phase):
     assert reverse.travelling_index.value == index
 
 
+@pytest.mark.slow
 def test_a_standing_wave_has_no_direction_and_an_interval_to_zero():
     random = np.random.default_rng(1)
     to_zero = 0

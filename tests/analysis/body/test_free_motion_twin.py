@@ -16,6 +16,7 @@ def motion():
     return motion_tables.twin_motions(servo, tables, max(motion_tables.CYCLES))[0]
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("cycles", motion_tables.CYCLES)
 def test_intervals_of_the_twin_hold_its_motion_without_noise(motion, cycles):

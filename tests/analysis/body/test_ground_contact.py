@@ -68,6 +68,7 @@ def test_means_are_those_of_straight_lines_between_samples():
     np.testing.assert_allclose(means, 3 * (edges[1:] + edges[:-1]) / 2 - 1)
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", contact_tables.LIFTING)
 def test_contact_in_the_twin_is_right_as_often_as_stated(name):

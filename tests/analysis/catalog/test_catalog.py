@@ -187,6 +187,7 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
     assert catalog.find("path = 'copy.mcap'").status.to_list() == ["analysed"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [None, b""], ids=["missing", "empty"])
 def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     path = tmp_path / "run.mcap"

@@ -23,6 +23,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_analyse_of_a_folder_is_a_table_and_a_list_of_results(folder, tmp_path, command):
     lines = command("analyse", folder, code=1).out.splitlines()
     assert len(lines) == 4

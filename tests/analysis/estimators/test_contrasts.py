@@ -27,6 +27,7 @@ def test_contrasts_cover_whatever_joints_share(shared, correlation):
     assert 0.925 < covered[:, JOINTS:].mean() < 0.975  # four contrasts: 0.6 %
 
 
+@pytest.mark.slow
 def test_joints_at_different_rates_and_short_records():
     for covered in judged("additive", 0.9, every=(1, 2, 3)):
         assert 0.93 < covered[:JOINTS].mean() < 0.97
@@ -34,6 +35,7 @@ def test_joints_at_different_rates_and_short_records():
         assert 0.92 < covered[:JOINTS].mean() < 0.98
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])
 @pytest.mark.parametrize("correlation", [0.0, 0.9])

@@ -7,6 +7,7 @@ import pytest
 GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.001, 0.05])
 @pytest.mark.parametrize("lost", [0.0, 0.2])
@@ -29,6 +30,7 @@ def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
         assert abs(np.mean(errors)) < 4 * bound / draws**0.5 + bound**2
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [0.0, 0.2])
 @pytest.mark.parametrize("ar", [0.0, 0.9])

@@ -82,6 +82,7 @@ class Trials:
         return np.sqrt(np.mean(np.square(self.lag))) / self.bound
 
 
+@pytest.mark.slow
 def test_lag_gain_and_intervals_with_exact_commands():
     trials = Trials(seed=11)
     # 2,000 lags: the ratio's own standard error is 1.6 %, the coverage's 0.5 %.
@@ -96,6 +97,7 @@ def test_lag_gain_and_intervals_with_exact_commands():
     assert all(trials.omega_inside)
 
 
+@pytest.mark.slow
 def test_two_noisy_channels_and_the_shared_frequency():
     trials = Trials(seed=12, noisy_command=True)
     assert 0.95 < trials.ratio() < 1.05

@@ -45,6 +45,8 @@ def test_no_step_in_few_levels():
     assert lattice_step(np.sign(turn(1.0))) == 0
 
 
+SLOW = [pytest.mark.slow, pytest.mark.built("tables")]
+
 FEW = {"draws": 500}
 """The standard error of the coverage is 1 %."""
 
@@ -56,10 +58,7 @@ FEW = {"draws": 500}
         ("0.5 Hz at 50 Hz, mean zero", FEW),
         ("the same, command rounded as well", FEW),
         ("the same, noise of 1 step", FEW),
-        *(
-            pytest.param(name, {"seed": 2}, marks=pytest.mark.slow)
-            for name in estimator_tables.ROUNDED
-        ),
+        *(pytest.param(name, {"seed": 2}, marks=SLOW) for name in estimator_tables.ROUNDED),
     ],
 )
 def test_intervals_of_rounded_channels(name, options):

@@ -117,6 +117,7 @@ def test_a_weak_module_is_named(weak):
     assert by_name["joint13"].mirror == "joint13"
 
 
+@pytest.mark.slow
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
     end = "; boundary or module is open: one direction only; record the reverse"

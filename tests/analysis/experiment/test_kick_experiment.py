@@ -146,6 +146,7 @@ def test_the_order_of_the_files_does_not_matter(result, sessions):
     assert again.checks_pass
 
 
+@pytest.mark.slow
 def test_phase_kicks_alone_give_p_and_r(sessions):
     result = experiment(sessions[: 1 + 2 * M])
     coupling = result.coupling

@@ -99,6 +99,7 @@ def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command)
     assert "Dashed: standard deviation" in page.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["odd", "even"])
 def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
     bent = {"cube": 2.5} if order == "odd" else {"square": 1.0}

@@ -44,6 +44,7 @@ def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs
     assert found["half"] <= 1.5 * 1.96 * math.sqrt(2) * sigma / (2 * kick_tables.KICK)
 
 
+@pytest.mark.slow
 def test_without_coupling_the_headline_shows_none():
     found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
     assert found["headline"] <= 0.05

@@ -6,7 +6,7 @@ import pytest
 from support import closed_loop
 from support.compensating import Stage, Wave
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.built("tables")]
 
 
 def from_sessions(folder, m):

@@ -148,6 +148,7 @@ def test_what_scrolls_can_be_reached_by_the_keyboard(page):
             assert node.attributes["tabindex"] == "0"
 
 
+@pytest.mark.slow
 def test_headings_and_reason_of_a_missing_coupling(snake_page):
     root = tree(snake_page)
     headings = [h.text() for h in root.all("h1", "h2", "h3")]

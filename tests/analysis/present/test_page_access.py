@@ -40,6 +40,7 @@ def nodes(browser):
     ]
 
 
+@pytest.mark.slow
 def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     browser.open(address)
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")

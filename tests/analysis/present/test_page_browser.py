@@ -52,6 +52,7 @@ def address(tmp_path_factory, request):
     return write
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     url = address(name)
@@ -103,6 +104,7 @@ def test_the_tab_key_reaches_the_skip_link_first_and_every_figure(browser, addre
     assert any(label.startswith("Table: response of every joint") for label in reached)
 
 
+@pytest.mark.slow
 def test_it_prints_on_white_with_its_figures(browser, address):
     browser.open(address("snake"), dark=True)
     printed = browser.call("Page.printToPDF", preferCSSPageSize=True)["data"]

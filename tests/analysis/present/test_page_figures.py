@@ -57,6 +57,7 @@ def panel(page, number, section="segments"):
     return page.evaluate(MARKS.replace("PANEL", str(number)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_pointing_at_a_mark_shows_joint_value_interval_and_unit(page, snake, number):
     driven = [joint for joint in snake.joints if joint.gain.value is not None]

@@ -106,6 +106,7 @@ def entries(count):
     return Entries("P", "meaning", names, names, value, np.full_like(value, 0.1), *words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "small"), [(4, False), (30, False), (5, True)])
 def test_a_matrix_has_the_colours_of_its_cells(count, small, tmp_path):
     shown = entries(count)

@@ -139,6 +139,7 @@ def test_a_coupling_is_one_row_a_pair(kicked):
     np.testing.assert_allclose(frame["P"].groupby("joint").sum(), totals)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pictures"),
     [
@@ -166,6 +167,7 @@ def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path
         result.plot("nonsense")
 
 
+@pytest.mark.slow
 def test_two_figures_on_one_page_share_no_identifier(snake):
     first, second = (snake.plot()._repr_html_() for _ in range(2))
     ids = [{part.split('"')[0] for part in one.split(' id="')[1:]} for one in (first, second)]

@@ -91,6 +91,7 @@ def columns(path, key):
     return times, np.array([json.loads(row[key]) for row in rows])
 
 
+@pytest.mark.slow
 @needs_recordings
 def test_the_halves_of_an_arms_multisine_agree(tmp_path):
     folder = SHARED / "so101/multisine"

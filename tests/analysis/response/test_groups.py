@@ -20,6 +20,7 @@ from undulog.analysis.response.groups import (
 Snake, GOLDEN = group_tables.Snake, group_tables.GOLDEN
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "bend"), [(1.0, 0.0), (1.5, 0.0), (GOLDEN, 0.02)])
 def test_lags_at_the_bound_and_intervals_that_hold_in_each_group(ratio, bend):
@@ -141,6 +142,7 @@ def test_lines_of_the_other_groups_are_distinct():
     assert further_lines([3.0, 2.0, 2.96], 1, 1, 100.0, 60.0)[:2] == (3.0, 6.0)  # 0.04: 0.4 / T
 
 
+@pytest.mark.slow
 def test_mixed_tones_are_modelled_where_they_stand_out_and_only_there():
     """At 2 f2 - f1 and 3 f1 - 3 f2, three and ten times an amplitude's noise, in all joints."""
     rng = np.random.default_rng(6)

@@ -69,6 +69,7 @@ def test_an_experiment_of_each_kind(experiment, tmp_path, report_of):
     assert faults("experiment", result) == []
 
 
+@pytest.mark.slow
 def test_a_comparison(tmp_path, report_of):
     before, _, after, *_ = linear_chain.both_ways(tmp_path)
     assert faults("comparison", report_of("compare", before, after)) == []

@@ -80,6 +80,7 @@ def sensor_flags(result):
     return [(one.joint, one.flag) for one in result.artefacts if one.about == "sensor"]
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STEADY)
 def test_a_steady_scenario_closes_its_balance_and_has_sound_sensors(name, tmp_path):
@@ -95,6 +96,7 @@ def test_a_steady_scenario_closes_its_balance_and_has_sound_sensors(name, tmp_pa
     assert result.energy.electrical == "simulated"
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", AMONG_OBSTACLES)
 def test_contact_makes_no_speed_that_a_sensor_is_blamed_for(name, tmp_path):
@@ -104,6 +106,7 @@ def test_contact_makes_no_speed_that_a_sensor_is_blamed_for(name, tmp_path):
         assert abs(getattr(result.energy.closure, kind)) <= 0.005
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ADAPTIVE)
 def test_an_adaptive_scenario_gives_sense_over_time(name, tmp_path):

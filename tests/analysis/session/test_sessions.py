@@ -60,6 +60,7 @@ def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
     assert abs(np.degrees(np.polyfit(truth.skew_s, np.mean(error, axis=0), 1)[0] * 5e-3)) < 0.05
 
 
+@pytest.mark.slow
 def test_polling_skew_biases_the_lag_only_where_it_is_not_logged(bag, wave):
     truth = wave(np.random.default_rng(3))
     still = np.zeros((truth.ticks_ns.size, 25))

@@ -172,6 +172,7 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     assert found.startswith("electrical energy is 300 J from the samples but 240 J")
 
 
+@pytest.mark.slow
 def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, result):
     assert result.energy.unknown == (
         "mechanical energies are products of sampled torque and velocity and electrical energies "
@@ -192,6 +193,7 @@ def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_p
     assert [joint.energy_el_clipped_j for joint in result.joints] == pytest.approx([21.0] * 25)
 
 
+@pytest.mark.slow
 def test_a_change_of_gait_splits_the_session(tmp_path):
     path = write_twin(tmp_path / "two.mcap", duration=22.0, change=1000, odometry=False)
     result = analysed(path)

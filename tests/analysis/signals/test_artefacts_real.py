@@ -94,6 +94,7 @@ def arm(tmp_path_factory):
         return analyse_session(session)
 
 
+@pytest.mark.slow
 def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
     assert all(joint.gain.value is not None for joint in arm.joints)
     wrong = {(one.joint, one.quantity, one.flag) for one in arm.artefacts if one.about == "sensor"}

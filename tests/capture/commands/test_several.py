@@ -86,6 +86,7 @@ def test_bags_in_folders_and_patterns_are_one_session_each(bags):
     assert sessions_of([single]) == [single]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [("log", "info"), ("log", "check"), ("analyse",)])
 def test_commands_read_the_bags_of_a_folder(line, bags, report_of, command):
     rows = report_of(*line, bags / "day")

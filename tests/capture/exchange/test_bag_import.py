@@ -186,6 +186,7 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
             np.testing.assert_array_equal(first.t_ns, second.t_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypatch):
     def write(own, *tick):

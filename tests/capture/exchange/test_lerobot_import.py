@@ -106,6 +106,7 @@ def test_a_damaged_description_is_named(text, tmp_path):
         import_lerobot(folder, tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not G1.exists(), reason=f"the G1 data are not at {G1}")
 def test_a_humanoid(tmp_path, command):
     (report,) = import_lerobot(G1, tmp_path / "g1.mcap", episode=2)

@@ -122,6 +122,7 @@ def test_columns_of_one_name(tmp_path):
         open_table(path)
 
 
+@pytest.mark.slow
 def test_a_mat_element_that_expands(tmp_path):
     savemat(tmp_path / "x.mat", {"time": T, "q": T}, do_compression=True)
     data = (tmp_path / "x.mat").read_bytes()
@@ -135,6 +136,7 @@ def test_a_mat_element_that_expands(tmp_path):
         open_table(path)
 
 
+@pytest.mark.slow
 def test_a_long_table_in_any_order(tmp_path):
     """Rows of three joints, shuffled, are the samples that they are in order."""
     rng = np.random.default_rng(1)

@@ -56,6 +56,7 @@ def test_the_base_of_a_session(tmp_path, report_of):
     np.testing.assert_array_equal(numbers, np.hstack([positions, turns]))  # bit for bit
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=3))
 def test_numbers_come_back_bit_for_bit(tmp_path_factory, position):
     folder = tmp_path_factory.mktemp("tum")

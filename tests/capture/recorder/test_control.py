@@ -104,6 +104,7 @@ def test_a_mistake_of_ours_is_reported_and_ends_nothing(server, client):
     assert server.take_faults() == ()
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=400))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_whatever_comes_each_line_gets_one_line(server, data):

@@ -1,5 +1,6 @@
 """What is due once a second is done once a second, however often one asks."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -8,6 +9,7 @@ from undulog.capture.recorder.status import EachSecond
 NS = 1_000_000_000
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(1_000_000, 200_000_000), min_size=200, max_size=400))
 def test_once_a_second_and_one_at_a_time(steps):
     done = [[], [], []]

@@ -258,6 +258,7 @@ def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path, out
 # -- while it runs --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_split_session_is_one_session(tmp_path, output, bus, opened):
     frames, _ = polling(300)
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:

@@ -91,6 +91,7 @@ def test_a_recording_from_status_to_stop(recorder, place, ask, opened):
     assert find_sockets(os.environ) == []
 
 
+@pytest.mark.slow
 def test_of_several_recorders_one_must_be_named(recorder, place, ask):
     first, second = recorder("one"), recorder("two")
     out = ask("status").out
@@ -109,6 +110,7 @@ def test_of_several_recorders_one_must_be_named(recorder, place, ask):
     assert (first.returncode, second.returncode) == (0, 0)
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_while_we_wait_is_reported(recorder):
     process = recorder("run")
     process.send_signal(signal.SIGSTOP)
@@ -199,6 +201,7 @@ def test_a_unit_that_cant_be_written_is_an_error(tmp_path, ask):
     assert str(nowhere) in ask("unit", "--install", "--folder", nowhere, code=2).err
 
 
+@pytest.mark.slow
 def test_two_outputs_of_one_name_in_two_folders(recorder, place, ask):
     started = []
     for folder in ("a", "b"):

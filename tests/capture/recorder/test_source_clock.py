@@ -220,6 +220,7 @@ def test_a_stalled_host_does_not_move_the_line():
     assert clock.result().resets == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_ms", [-20, 20])
 def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms):
     made = make(duration_s=90.0, polled=False)
@@ -230,6 +231,7 @@ def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms):
     assert clock.result().resets == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("silence_s", [30, 900, 40_000])
 def test_a_long_silence_is_no_reset_and_the_offset_is_found_at_once(silence_s):
     """The rate moves by 1 ppm meanwhile, as a quartz's does from one room to the next."""

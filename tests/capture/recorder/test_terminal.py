@@ -197,6 +197,7 @@ def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(monkeypatch):
         assert "\x1b[2K" in read_until(ours, "the report")  # lines of the screen are erased
 
 
+@pytest.mark.slow
 def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(monkeypatch):
     """As after Ctrl-S: nobody reads, the kernel's buffer is full, a write waits for ever."""
     monkeypatch.setenv("TERM", "xterm-256color")
@@ -214,6 +215,7 @@ def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(monkeypatch):
                 os.read(ours, 1 << 16)
 
 
+@pytest.mark.slow
 def test_a_process_whose_terminal_is_stuck_can_end():
     program = (
         "import sys, time\n"

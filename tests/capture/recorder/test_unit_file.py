@@ -166,6 +166,7 @@ def control(runtime, *words):
     return undulog("record", *words, env={**os.environ, "RUNTIME_DIRECTORY": str(runtime)})
 
 
+@pytest.mark.slow
 def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):
     process, manager = service()
     heard(manager, "READY=1")

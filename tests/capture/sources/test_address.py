@@ -70,6 +70,7 @@ def test_two_sources_need_two_names(tmp_path):
         open_sources([])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [("pybullet", "mujoco"), ("tomlkit",)])
 def test_a_source_without_its_extra_names_it(hidden):
     code = (

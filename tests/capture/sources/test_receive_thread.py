@@ -116,6 +116,7 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
             receiver.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
     path, output = tmp_path / "bus.sock", tmp_path / "run.mcap"
@@ -131,6 +132,7 @@ def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
     assert report["sources"]["bus"]["frames"] == accepted
 
 
+@pytest.mark.slow
 def test_a_stream_is_kept_up_to_the_end(tmp_path):
     """socketcand can't refuse: what was sent before the signal is there, and nothing is missing."""
     output = tmp_path / "run.mcap"
@@ -212,6 +214,7 @@ def test_priority_is_what_the_system_grants_and_is_given_back():
     assert (after, os.getpriority(os.PRIO_PROCESS, 0)) == before
 
 
+@pytest.mark.slow
 @root_only
 @pytest.mark.parametrize(
     ("before", "text"),

@@ -47,6 +47,7 @@ def packets_in(records):
     return packets, all_bytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["feetech", "dynamixel2"])
 def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(tmp_path, listen, line, protocol):
     make = feetech_packet if protocol == "feetech" else dynamixel_packet

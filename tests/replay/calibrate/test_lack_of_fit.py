@@ -35,6 +35,7 @@ def of_kind(random, kind):
     return colored(random, kind, T.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [0.0, 0.9, 0.99, "mixed"])
 def test_the_level_holds_under_noise_with_a_memory(kind):
     random = np.random.default_rng(1)
@@ -55,6 +56,7 @@ def test_it_finds_what_comes_back_every_cycle():
         assert size == pytest.approx(loud * 0.7 * SIGMA / math.sqrt(2), rel=0.25)
 
 
+@pytest.mark.slow
 def test_samples_at_their_own_times_and_a_drift():
     random = np.random.default_rng(3)
     t = np.sort(random.uniform(0, 6.5, 600))

@@ -329,6 +329,7 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, o
     assert "/compared/a/angles" not in found.entities
 
 
+@pytest.mark.slow
 def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path, overlaid):
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
@@ -366,6 +367,7 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
@@ -417,6 +419,7 @@ def converted(files, tmp_path_factory):
         ]
 
 
+@pytest.mark.slow
 def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     path = tmp_path / "x.rrd"
     path.write_bytes(b"mine")

@@ -72,6 +72,7 @@ def converted(session_file, path):
         write_recording(session, path)
 
 
+@pytest.mark.slow
 def test_stretches_leave_no_seam(session_file, tmp_path, read_back, monkeypatch):
     converted(session_file, tmp_path / "whole.rrd")
     monkeypatch.setattr(stretches, "STRETCH_NS", 1_000_000_000)

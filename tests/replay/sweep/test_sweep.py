@@ -75,6 +75,7 @@ def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
     assert len(list((tmp_path / "rows" / "sessions").glob("*.mcap"))) == 10
 
 
+@pytest.mark.slow
 def test_a_dry_run_runs_nothing(reference, tmp_path, command, report_of):
     plan = reference / "plan.toml"
     printed = command("sweep", plan, "-o", tmp_path / "rows", "--dry-run").out

@@ -87,6 +87,7 @@ def test_angles_are_those_of_the_twin_on_mujoco_under_every_law(weak):
         np.testing.assert_allclose(run.angle, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gain_and_lag_over_5_s_are_those_of_the_twin_on_mujoco(weak):
     scenario = weak.changed(duration_s=5.0)
     (run,) = run_batch([scenario])
@@ -299,6 +300,7 @@ np.savez(sys.argv[2], *[part for one in done for part in (one.angle, one.work, o
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [FrictionLaw.ELLIPSE, None])
 def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
     """By numba's simulator of a GPU, which runs the kernel and its copies thread by thread.

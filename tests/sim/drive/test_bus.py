@@ -181,6 +181,7 @@ def planned(what, on, output, *, duration_s=0.2, robot=None):
     return bus_plan(find_motion(what), on, output, robot, duration_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", list(OnFault))
 def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     path, stop = tmp_path / "a.mcap", StopRequest()
@@ -246,6 +247,7 @@ def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_pa
     assert not raw[:, -1].any()
 
 
+@pytest.mark.slow
 def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
     """A session whose first command is bent: the robot stands straight."""
     recorded, path = tmp_path / "bent.mcap", tmp_path / "a.mcap"
@@ -410,6 +412,7 @@ def test_nobody_there_exits_1(tmp_path, command):
     assert "refused" in command("drive", "flat", "--on", on, *words, code=1).err
 
 
+@pytest.mark.slow
 def test_a_robot_that_says_nothing_is_sent_nothing(tmp_path):
     answers = SOCKETCAND | {"undulog": b"< undulog virtual-robot snake25 paced >"}
     silent = pytest.raises(SourceError, match=r"no command was sent: the pose is not known, all 25")

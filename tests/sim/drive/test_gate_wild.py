@@ -8,6 +8,7 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -56,6 +57,7 @@ class Drawn:
         return GaitTick(self.wish, np.empty(0), "drawn", ())
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(
     arrays(np.float64, COUNT, elements=st.floats(-0.7, 0.7), fill=st.just(0.0)),

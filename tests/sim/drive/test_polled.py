@@ -66,6 +66,7 @@ def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():
     assert not len(poll_frames(load_robot("snake25")))  # it tells unasked
 
 
+@pytest.mark.slow
 def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     angles = 0.5 + 0.2 * np.sin(np.arange(121).clip(max=40) / 10)  # then it catches up
     one = Servo(math.degrees(0.3))

@@ -45,6 +45,7 @@ def changed(text: str, rng: random.Random) -> str:
     return text[: found.start()] + rng.choice(ODD) + text[found.end() :]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["capture/robot/shipped", "sim/scenarios"])
 def test_odd_numbers_end_in_a_run_or_an_error_of_ours(folder, tmp_path, capsys):
     texts = [path.read_text() for path in sorted((ROOT / folder).glob("*.toml"))]

@@ -5,6 +5,7 @@ import socket
 from contextlib import suppress
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,6 +43,7 @@ def test_any_way_of_cutting_what_a_client_sends_gives_the_same(pieces, seed):
     assert found == whole
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(pieces=anything)
 def test_nothing_that_a_client_sends_harms_the_others(pieces):

@@ -272,6 +272,7 @@ def test_without_faults_nothing_is_changed(robot):
     assert [frames["id_flags"].tolist() for frames in shown] == [[513, 514, 515, 516]] * 5
 
 
+@pytest.mark.slow
 def test_lost_replies_are_those_of_the_joint_in_the_share_that_was_ordered(robot):
     line = fault_line(robot, "lost:joint02:0.3")
     shown = np.concatenate(cycles(robot, line, 2000))

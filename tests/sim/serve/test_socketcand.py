@@ -265,6 +265,7 @@ def test_a_client_that_makes_no_sense_is_let_go(serving):
     assert serving.server.dropped == 1
 
 
+@pytest.mark.slow
 def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(serving):
     with serving.lock:
         serving.pulling = False

@@ -153,6 +153,7 @@ def test_the_median_interval_covers_as_often_as_it_says(study):
     assert median_interval([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
+@pytest.mark.built("tables")
 @pytest.mark.slow
 def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Two of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""

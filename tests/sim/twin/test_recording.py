@@ -253,6 +253,7 @@ def long_run(path):
     return process
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_leaves_no_session_under_its_name(tmp_path):
     process = long_run(tmp_path / "killed.mcap")
     process.kill()
@@ -260,6 +261,7 @@ def test_a_run_that_is_killed_leaves_no_session_under_its_name(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["killed.mcap.part"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_run_leaves_a_whole_session(tmp_path, number):
     path = tmp_path / "killed.mcap"
@@ -358,6 +360,7 @@ def test_the_command_line_reports(tmp_path, command, report_of):
     assert "name it b.mcap" in command("sim", "run", "flat", "-o", "b.csv", code=2).err
 
 
+@pytest.mark.slow
 def test_the_command_line_lists_the_scenarios(command, report_of):
     text = command("sim", "list").out
     listed = report_of("sim", "list")

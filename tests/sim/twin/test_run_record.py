@@ -88,6 +88,7 @@ def test_a_session_without_the_record_gives_the_same_facts(folder, file, opened)
     assert not old.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [("analyse", "run.mcap"), ("analyse", "free.mcap"), ("compare", "run.mcap", "free.mcap")],

@@ -35,6 +35,7 @@ def two_cycles(make_scenario, make_robot):
     return {degrees: speed(math.radians(degrees)) for degrees in (0, 30, 45, 90)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [30, 45, 90])
 def test_speed_does_not_depend_on_the_heading(two_cycles, degrees):
     reference, turned = two_cycles[0], two_cycles[degrees]

@@ -132,6 +132,7 @@ _ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELE
 _MESSAGES = "id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "match"),
     [

@@ -183,6 +183,7 @@ def test_a_folder_that_is_gone_is_reported(tmp_path):
 # -- reading -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_naming_any_part_or_the_folder_opens_the_whole(tmp_path, command):
     split_session(tmp_path / "run.mcap")
     for name in ("run.mcap", "run_0002.mcap", "run_0003.mcap", "."):

@@ -134,6 +134,7 @@ IMAGE = (
 )
 
 
+@pytest.mark.slow
 def test_constant_images_open_however_well_they_compress(tmp_path):
     """Black pictures, zero depth and an empty map compress 10,000 times and more."""
     log = HostileLog()

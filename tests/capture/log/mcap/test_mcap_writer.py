@@ -100,6 +100,7 @@ def written(kind, calls, chunk_size):
     return stream.getvalue(), ids
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(calls=CALLS, chunk_size=st.integers(1, 400))
 def test_the_bytes_are_those_of_the_library(calls, chunk_size):
@@ -107,6 +108,7 @@ def test_the_bytes_are_those_of_the_library(calls, chunk_size):
     assert ours == theirs
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(calls=CALLS, chunk_size=st.integers(1, 400), waiting=st.integers(0, 1500))
 def test_helper_threads_change_no_byte(calls, chunk_size, waiting):

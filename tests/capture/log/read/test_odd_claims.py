@@ -45,6 +45,7 @@ def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(tmp_pat
     assert (other.count, other.unread) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(tmp_path, command):
     log = joints()
     times = [EPOCH_NS + NS + k * 10_000 for k in range(5_000)]

@@ -42,6 +42,7 @@ def test_a_page_that_is_written_no_more_is_synced_in_the_end(tmp_path):
         wait_for(lambda: wal.synced == 1000, "the last page")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 2 * PAGE])
 def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
     output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"

@@ -253,6 +253,7 @@ def test_marks_wait_their_turn_and_too_many_are_refused(tmp_path):
     assert [len(read(path)) for path in paths] == [1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_and_what_went_early_is_counted(tmp_path):
     bound = 8 << 20
     ring = defined(RingSink(tmp_path / "run.mcap", 3600 * SECOND, max_bytes=bound))
