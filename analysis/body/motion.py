@@ -12,7 +12,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import NS, BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
-from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at
@@ -119,8 +119,7 @@ def link_centres(
         rows = inside[first : first + _CHUNK]
         shape = np.stack([one.at(t_s[rows]) for one in angles], axis=-1)
         rotation = rotation_from_quaternion(quaternion[rows])
-        centres, _ = link_poses(robot, position[rows], rotation, shape)
-        yield t_s[rows], centres
+        yield t_s[rows], link_positions(robot, position[rows], rotation, shape)
 
 
 def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[BodyPoint, ...]:

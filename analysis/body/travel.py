@@ -19,7 +19,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
-from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.harmonic import HarmonicModel, fit_at
@@ -109,7 +109,7 @@ def centre_of_mass(robot: Robot, t_s: FloatArray, poses: Poses, angles: FloatArr
     turn = _at(t_s, known_s, quaternion * np.cumprod(np.append(1.0, flips))[:, None])
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     head = _at(t_s, known_s, position)
-    centres, _ = link_poses(robot, head, rotation_from_quaternion(turn), angles)
+    centres = link_positions(robot, head, rotation_from_quaternion(turn), angles)
     masses = np.array([link.mass for link in robot.links])
     return np.einsum("l,nlk->nk", masses / masses.sum(), centres)
 

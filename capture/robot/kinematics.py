@@ -97,21 +97,6 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     return sign * unit
 
 
-def _joint_rotations(robot: Robot, angles: FloatArray) -> FloatArray:
-    """Return the rotation of each rear link in its front link's frame, (..., m, 3, 3)."""
-    yaw = np.array([joint.plane is Plane.HORIZONTAL for joint in robot.joints])
-    c, s = np.cos(angles), np.sin(angles)
-    rotation = np.zeros((*angles.shape, 3, 3), dtype=np.float64)
-    rotation[..., 0, 0] = c
-    rotation[..., 1, 1] = np.where(yaw, c, 1.0)
-    rotation[..., 2, 2] = np.where(yaw, 1.0, c)
-    rotation[..., 0, 1] = np.where(yaw, -s, 0.0)
-    rotation[..., 1, 0] = np.where(yaw, s, 0.0)
-    rotation[..., 0, 2] = np.where(yaw, 0.0, s)
-    rotation[..., 2, 0] = np.where(yaw, 0.0, -s)
-    return rotation
-
-
 def link_poses(
     robot: Robot, head_position: FloatArray, head_rotation: FloatArray, angles: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -124,22 +109,86 @@ def link_poses(
         angles: Joint angles [rad], shape (..., m).
 
     Returns:
-        Link centres [m], shape (..., m + 1, 3), and rotations, shape (..., m + 1, 3, 3).
+        Link centres [m], shape (..., m + 1, 3), and rotations, shape (..., m + 1, 3, 3); NaN
+        behind the first joint whose angle is NaN.
 
     Raises:
         DataError: If ``angles`` has not one column a joint.
     """
+    lead = _lead(robot, angles)
+    rotation = np.empty((len(robot.links), 3, 3, *lead), dtype=np.float64)
+    position = _along(robot, head_position, head_rotation, angles, rotation)
+    lost = np.isnan(position[:, 0])
+    if lost.any():  # a joint's own axis does not turn with it
+        np.copyto(rotation, np.nan, where=lost[:, None, None])
+    return np.moveaxis(position, (0, 1), (-2, -1)), np.moveaxis(rotation, (0, 1, 2), (-3, -2, -1))
+
+
+def link_positions(
+    robot: Robot, head_position: FloatArray, head_rotation: FloatArray, angles: FloatArray
+) -> FloatArray:
+    """Return the centres of all links in the world: :func:`link_poses` without orientations.
+
+    Args:
+        robot: The robot, m joints.
+        head_position: Centre of the head link [m], shape (..., 3).
+        head_rotation: Orientation of the head link, shape (..., 3, 3).
+        angles: Joint angles [rad], shape (..., m).
+
+    Returns:
+        Shape (..., m + 1, 3) [m]; NaN behind the first joint whose angle is NaN.
+
+    Raises:
+        DataError: If ``angles`` has not one column a joint.
+    """
+    two = np.empty((2, 3, 3, *_lead(robot, angles)), dtype=np.float64)
+    position = _along(robot, head_position, head_rotation, angles, two)
+    return np.moveaxis(position, (0, 1), (-2, -1))
+
+
+def _lead(robot: Robot, angles: FloatArray) -> tuple[int, ...]:
     m = len(robot.joints)
     if angles.shape[-1:] != (m,):
         raise DataError(f"angles has shape {angles.shape}; the robot {robot.name} has {m} joints")
-    turn = _joint_rotations(robot, angles)
-    position = np.empty((*angles.shape[:-1], m + 1, 3), dtype=np.float64)
-    rotation = np.empty((*angles.shape[:-1], m + 1, 3, 3), dtype=np.float64)
-    position[..., 0, :] = head_position
-    rotation[..., 0, :, :] = head_rotation
-    half = np.array([link.length / 2 for link in robot.links])
-    for i in range(m):
-        rotation[..., i + 1, :, :] = rotation[..., i, :, :] @ turn[..., i, :, :]
-        pivot = position[..., i, :] - half[i] * rotation[..., i, :, 0]
-        position[..., i + 1, :] = pivot - half[i + 1] * rotation[..., i + 1, :, 0]
-    return position, rotation
+    return angles.shape[:-1]
+
+
+def _along(
+    robot: Robot,
+    head_position: FloatArray,
+    head_rotation: FloatArray,
+    angles: FloatArray,
+    rotation: FloatArray,
+) -> FloatArray:
+    """Go from link to link, head to tail.
+
+    Instants are the last axes, so that each operation runs over neighbours in memory: a joint
+    turns two axes of its link, which takes a fifth of the time of products of small matrices.
+
+    Args:
+        rotation: Filled in, link i at place i modulo its length: axes as columns, shape
+            (k, 3, 3, ...), k at least 2 where there are joints.
+
+    Returns:
+        Centres [m], shape (m + 1, 3, ...).
+    """
+    position = np.empty((len(robot.links), 3, *angles.shape[:-1]), dtype=np.float64)
+    np.moveaxis(position[0], 0, -1)[...] = head_position
+    np.moveaxis(rotation[0], (0, 1), (-2, -1))[...] = head_rotation
+    turned = np.moveaxis(angles, -1, 0)
+    half = [link.length / 2 for link in robot.links]
+    for i, joint in enumerate(robot.joints):
+        front, rear = rotation[i % len(rotation)], rotation[(i + 1) % len(rotation)]
+        cosine, sine = np.cos(turned[i]), np.sin(turned[i])
+        # About z: x to y; about y: z to x.
+        first, second = (0, 1) if joint.plane is Plane.HORIZONTAL else (2, 0)
+        axis = 3 - first - second
+        np.multiply(cosine, front[:, first], out=rear[:, first])
+        rear[:, first] += sine * front[:, second]
+        np.multiply(cosine, front[:, second], out=rear[:, second])
+        rear[:, second] -= sine * front[:, first]
+        rear[:, axis] = front[:, axis]
+        np.multiply(-half[i], front[:, 0], out=position[i + 1])
+        position[i + 1] += position[i]
+        position[i + 1] -= half[i + 1] * rear[:, 0]
+    return position

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError, UsageError
-from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ, Readings
@@ -101,7 +101,7 @@ class BatchRun:
         """The robot's centre of mass [m], shape (k, 3)."""
         robot = self.scenario.robot
         turn = rotation_from_quaternion(self.head_quaternion)
-        centres, _ = link_poses(robot, self.head, turn, self.angle)
+        centres = link_positions(robot, self.head, turn, self.angle)
         mass = np.array([link.mass for link in robot.links])
         return np.einsum("i,kij->kj", mass / mass.sum(), centres)
 

@@ -60,3 +60,23 @@ def test_many_instants_at_once_are_the_same_as_one_by_one():
 def test_a_wrong_number_of_angles_is_reported():
     with pytest.raises(DataError, match=r"shape \(3, 5\); the robot snake13 has 12 joints"):
         kinematics.link_poses(ROBOT, np.zeros(3), np.eye(3), np.zeros((3, 5)))
+
+
+def test_an_angle_that_is_not_known_leaves_what_is_in_front_of_its_joint():
+    angles = RNG.normal(scale=0.4, size=(2, 12))
+    angles[1, 4] = np.nan
+    position, rotation = kinematics.link_poses(ROBOT, np.zeros(3), np.eye(3), angles)
+    known = np.arange(13) <= 4
+    for found in (position[1], rotation[1].reshape(13, 9)):
+        np.testing.assert_array_equal(np.isfinite(found).all(axis=1), known)
+        np.testing.assert_array_equal(np.isnan(found).all(axis=1), ~known)
+    assert np.isfinite(position[0]).all()
+    assert np.isfinite(rotation[0]).all()
+
+
+def test_positions_are_those_of_the_poses():
+    angles = RNG.normal(scale=0.4, size=(5, 12))
+    heads = Rotation.random(5, rng=RNG).as_matrix()
+    position, _ = kinematics.link_poses(ROBOT, RNG.normal(size=3), heads, angles)
+    found = kinematics.link_positions(ROBOT, position[:, 0], heads, angles)
+    np.testing.assert_array_equal(found, position)
