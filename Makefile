@@ -48,12 +48,12 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
 # Three processes at once: two of tests that compute, in the time that the third leaves them, which
-# has the tests of processes and time.
+# has the tests of processes, time and pictures.
 ANALYSIS = tests/analysis
 COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py \
   $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw overlay sweep) \
-  $(addprefix tests/replay/test_,clip.py golden.py pictures.py reproduce.py) \
+  $(addprefix tests/replay/test_,clip.py reproduce.py) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 define tests
 	@logs=$$(mktemp -d); \
