@@ -111,12 +111,15 @@ pages: $(READY)  ## what takes long in the manual: real robots (DATA=FOLDER with
 	$(MAKE) -j2 --output-sync=target pages-scripts pages-tables
 	$(BIN)/python docs/built_from.py $(DATA)
 
+# What is noted as built must not have been skipped for want of a tool.
+BUILDING = UNDULOG_BUILD_PAGES=1 UNDULOG_REQUIRE_ALL_TESTS=1
+
 pages-scripts: $(READY)
-	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -p no:cacheprovider -m built tests/docs \
+	$(BUILDING) $(BIN)/python -m pytest -p no:cacheprovider -m built tests/docs \
 	  --ignore=tests/docs/test_real_robots.py
 
 pages-tables: $(READY)
-	UNDULOG_BUILD_PAGES=1 $(BIN)/python -m pytest -p no:cacheprovider -m built tests --ignore=tests/docs
+	$(BUILDING) $(BIN)/python -m pytest -p no:cacheprovider -m built tests --ignore=tests/docs
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py

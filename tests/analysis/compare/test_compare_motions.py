@@ -76,7 +76,7 @@ def test_false_alarms_are_at_most_one_in_twenty():
 @pytest.mark.slow
 @pytest.mark.parametrize("amplitudes", [WAVE, WEAK, INVERTED, STANDING, CIRCLE])
 def test_false_alarms_of_any_motion(amplitudes):
-    assert false_alarms(amplitudes, 90) <= 0.05 + 3 * (0.05 * 0.95 / 90) ** 0.5
+    assert false_alarms(amplitudes, 150) <= 0.05 + 3 * (0.05 * 0.95 / 150) ** 0.5
 
 
 def test_the_intervals_hold_the_planted_differences():
