@@ -106,7 +106,7 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/readme_figures.py docs/images
 
 DATA ?= ../shared/data
-pages: $(READY)  ## what takes long in the manual: real robots (DATA=FOLDER with recordings), study, tables
+pages: $(READY)  ## the long parts of the manual: real robots (DATA=FOLDER with recordings), study, tutorials, tables
 	$(BIN)/python docs/real_robots.py $(DATA)
 	$(MAKE) -j2 --output-sync=target pages-scripts pages-tables
 	$(BIN)/python docs/built_from.py $(DATA)

@@ -3,8 +3,9 @@
 ``make pages`` builds each part, then runs ``python docs/built_from.py DATA``, which notes the
 SHA-256 of what determines it: product, locked packages, scripts, and recordings in ``DATA``; and of
 the page itself, so that one edited by hand is found. A test builds a part again only if any of that
-has changed since. ``tables`` are long tests that hold what the manual's tables say, with fewer
-draws: a file of tests is among their inputs if it marks one ``built("tables")``.
+has changed since. ``tutorials`` are those that take minutes. ``tables`` are long tests that hold
+what the manual's tables say, with fewer draws: a file of tests is among their inputs if it marks
+one ``built("tables")``.
 """
 
 from __future__ import annotations
@@ -34,10 +35,14 @@ PARTS = {
     ),
     "study": ("docs/study", "docs/study.md", "tests/docs/test_study.py"),
     "scripts": (*SCRIPTS, "tests/docs/test_scripts.py"),
+    "tutorials": (
+        *("docs/tutorials", "tests/support"),
+        *("tests/conftest.py", "tests/docs/test_tutorials.py"),
+    ),
     "tables": (
         *SCRIPTS,
-        "bench/target_following.py",
-        "tests/support",
+        *("bench/target_following.py", "bench/measuring.py", "bench/records.py"),
+        *("tests/conftest.py", "tests/support"),
         "tests/zoo",
         *_marked("tables"),
     ),

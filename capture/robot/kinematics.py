@@ -118,9 +118,9 @@ def link_poses(
     lead = _lead(robot, angles)
     rotation = np.empty((len(robot.links), 3, 3, *lead), dtype=np.float64)
     position = _along(robot, head_position, head_rotation, angles, rotation)
-    lost = np.isnan(position[:, 0])
+    lost = np.logical_or.accumulate(np.moveaxis(~np.isfinite(angles), -1, 0))
     if lost.any():  # a joint's own axis does not turn with it
-        np.copyto(rotation, np.nan, where=lost[:, None, None])
+        np.copyto(rotation[1:], np.nan, where=lost[:, None, None])
     return np.moveaxis(position, (0, 1), (-2, -1)), np.moveaxis(rotation, (0, 1, 2), (-3, -2, -1))
 
 

@@ -316,7 +316,10 @@ def gaps(t_ns: IntArray) -> BoolArray:
     Returns:
         Shape (n - 1,), or (0,) for fewer than two samples.
     """
-    return np.asarray(np.diff(t_ns) > GAP_STEPS * typical_step_ns(t_ns), dtype=np.bool_)
+    steps = np.diff(t_ns)
+    if steps.size and steps.max() <= GAP_STEPS * steps.min():  # the median is between the two
+        return np.zeros(steps.size, dtype=np.bool_)
+    return np.asarray(steps > GAP_STEPS * typical_step_ns(t_ns), dtype=np.bool_)
 
 
 def mark_gaps(
@@ -335,8 +338,8 @@ def mark_gaps(
     Returns:
         Times and values with the rows put in; the arguments themselves where there is no gap.
     """
-    step = typical_step_ns(t_ns)
     before = np.flatnonzero(gaps(t_ns))
+    step = typical_step_ns(t_ns) if before.size or end_ns is not None else 0
     if end_ns is not None and t_ns.size and end_ns - t_ns[-1] > GAP_STEPS * step:
         before = np.append(before, t_ns.size - 1)
     if not before.size:

@@ -120,7 +120,8 @@ class CommandLatch:
 PERIOD_NS = NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
-_BEFORE_NS = 1_000_000  # the last pose at rest, before the first tick
+_BEFORE_NS = 1_000_000  # the last pose that is told before tick 0
+_JUST_BEFORE_NS = 1000  # that which is told after it: what a time on the bus is rounded to
 _NAMED = 8
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
@@ -189,6 +190,7 @@ class VirtualRobot:
         robot = self._robot = scenario.robot
         self._replies = ReplyEncoder(robot)
         self._latch = CommandLatch(robot)
+        self._rest_angle = self._latch.angle
         self._line = FaultLine((*scenario.faults, *faults), robot, self._replies, scenario.seed)
         self._tick = 0
         self._silent = False
@@ -239,7 +241,7 @@ class VirtualRobot:
         tick = self._tick
         if not tick:
             # Nothing is told before it: a controller in lockstep may speak, and knows the pose.
-            self._bus.mark(0, self._at_rest())
+            self._bus.mark(0, self._at_rest(self._pacer.now_ns()))
             self._begin()
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
             (self._idle if self._lockstep else self._serve)(wait_s)
@@ -269,15 +271,16 @@ class VirtualRobot:
             due_ns = self._pacer.now_ns()
             while not self._latch.frames:  # until then the servos tell where they are
                 if (late_ns := self._pacer.now_ns() - due_ns) >= 0:
-                    self._bus.send(self._at_rest())
+                    self._bus.send(self._at_rest(self._pacer.now_ns()))
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
                 self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / NS))
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             start_ns = self._pacer.now_ns() + PERIOD_NS // 2
-            # Nothing is told at tick 0, so the pose is told just before: else it is a long silence.
+            # The first cycle of the servos is told at tick 2. Until then their pose before it is
+            # told, here and at tick 1: else it is a long silence.
             while (left_ns := start_ns - _BEFORE_NS - self._pacer.now_ns()) > 0:
                 self._serve(left_ns / NS)
-            self._bus.send(self._at_rest())
+            self._bus.send(self._at_rest(self._pacer.now_ns()))
             self._pacer.start(start_ns)
         else:
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS)
@@ -324,14 +327,17 @@ class VirtualRobot:
             why = "commands came late" if self._lockstep else "the twin can't keep up"
             self._say("warn", f"{why}: simulated time stood still, and samples have a gap there")
 
-    def _at_rest(self) -> FrameArray:
-        """Return the servos' frames before the first command."""
-        return self._replies.at_rest(self._latch.angle, self._pacer.now_ns())
+    def _at_rest(self, t_ns: int) -> FrameArray:
+        """Return the servos' frames before tick 0."""
+        return self._replies.at_rest(self._rest_angle, t_ns)
 
     def _report(self, samples: Sequence[SensorSample], tick: int) -> FrameArray:
         """Send the sensor samples of a tick; returns the frames."""
         time_s = tick / CONTROL_RATE_HZ
         frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
+        if tick == 1 and self._wait_for_commands and not self._lockstep:
+            before_ns = self._pacer.start_ns - _JUST_BEFORE_NS
+            frames = np.concatenate([self._at_rest(before_ns), frames])
         shown = self._line.replies(frames, self._pacer.clock_ns(tick * PERIOD_NS), time_s)
         self._bus.send(shown)
         return shown

@@ -11,6 +11,8 @@ from undulog.capture import Session
 PAGES = sorted(path.stem for path in DOCS.glob("tutorials/[a-z]*.md") if path.stem != "index")
 MINUTES = 10
 PORT = "29536"
+LONG = {"body-or-module", "match-the-twin", "measure-coupling"}
+"""Twin runs of minutes: walked as ``make pages`` builds the manual, the others each time."""
 
 
 def page_of(name: str) -> str:
@@ -32,7 +34,13 @@ def test_every_command_is_of_undulog_or_a_shell(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.built("tutorials") if name in LONG else ())
+        for name in PAGES
+    ],
+)
 def test_a_stranger_gets_from_an_empty_home_to_the_end_of_the_page(name, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])

@@ -120,6 +120,7 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, driven, command, re
     assert one > 5 * two
 
 
+@pytest.mark.built("tables")
 def test_kicks_in_contact_predict_what_was_held_out(tmp_path, driven, command, report_of):
     """From a recorded gait to its coupling, by the commands: plan, drive, analyse."""
     (tmp_path / "chain.toml").write_text(ROBOT)

@@ -137,6 +137,7 @@ def long_chain(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.built("tables")
 def test_13_joints(long_chain):
     robot, lag_sweep, multisine = long_chain
     check(lag_sweep, robot, h=5e-3, z=0.02, seconds=10)
@@ -144,6 +145,7 @@ def test_13_joints(long_chain):
 
 
 @pytest.mark.slow
+@pytest.mark.built("tables")
 def test_both_plans_agree(long_chain):
     """At the frequency that they share they differ by the encoders' noise.
 
@@ -162,6 +164,7 @@ def test_both_plans_agree(long_chain):
 
 
 @pytest.mark.slow
+@pytest.mark.built("tables")
 def test_the_chain_is_reciprocal_and_reaches_far(long_chain):
     """Equal and opposite: Z is symmetric; and nearest neighbours hold the lesser part of it."""
     robot, lag_sweep, _ = long_chain

@@ -74,6 +74,14 @@ def test_an_angle_that_is_not_known_leaves_what_is_in_front_of_its_joint():
     assert np.isfinite(rotation[0]).all()
 
 
+def test_an_unknown_place_of_the_head_leaves_all_orientations():
+    angles = RNG.normal(scale=0.4, size=12)
+    position, rotation = kinematics.link_poses(ROBOT, np.full(3, np.nan), np.eye(3), angles)
+    assert np.isnan(position).all()
+    _, placed = kinematics.link_poses(ROBOT, np.zeros(3), np.eye(3), angles)
+    np.testing.assert_array_equal(rotation, placed)
+
+
 def test_positions_are_those_of_the_poses():
     angles = RNG.normal(scale=0.4, size=(5, 12))
     heads = Rotation.random(5, rng=RNG).as_matrix()

@@ -1,5 +1,7 @@
 """Joint samples: tables of common times, resampling against closed forms, and rounding."""
 
+import statistics
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -146,6 +148,13 @@ def test_samples_out_of_order_are_sorted():
     t, values = tracks.ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
     np.testing.assert_array_equal(t, ticks(0, 10, 20))
     np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
+
+
+@given(st.lists(st.integers(0, 12), min_size=1, max_size=12))
+def test_a_gap_is_five_times_the_median_of_the_steps_that_are_some(steps):
+    t = 2 * np.cumsum([0, *steps])
+    median = statistics.median([step for step in steps if step] or [0])
+    assert tracks.gaps(t).tolist() == [step > 5 * median for step in steps]
 
 
 @pytest.mark.parametrize("count", [0, 1])

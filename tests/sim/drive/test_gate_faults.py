@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +30,27 @@ ERROR = 40  # of rcl_interfaces/msg/Log
 class Driving:
     """A drive over the bus of the small robot, with a listener."""
 
-    def __init__(self, stage, controller, path):
-        self.stage, self.controller, self.path = stage, controller, path
+    def __init__(self, start):
+        self._start, self._running = start, ExitStack()
+        self._anew()
+
+    def _anew(self):
+        self._running.close()
+        self.stage, self.controller, self.path = self._start(self._running)
 
     def begun(self, count=150):
-        self.stage.wait_for_commands(self.controller, count)
+        """Wait until so many ticks were commanded; on a machine that stops for 30 ms begin anew."""
+        for left in (2, 1, 0):
+            try:
+                self.stage.wait_for_commands(self.controller, count)
+                break
+            except AssertionError as error:
+                if not left or "the bus was silent" not in str(error):
+                    raise
+            self._anew()
+
+    def close(self):
+        self._running.close()
 
     def signal(self, number, pause_s=0.0):
         self.controller.send_signal(number)
@@ -56,17 +72,18 @@ class Driving:
 
 @pytest.fixture
 def driving(small, session, tmp_path):
-    @contextmanager
-    def start(*faults, scenario=small[1], recorded=session, plain=False):
-        folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a test may drive several times
-        path = folder / "a.mcap"
-        with staged(folder, scenario, *faults) as stage:
+    def started(*faults, scenario=small[1], recorded=session, plain=False):
+        def start(running):
+            folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a test may drive several times
+            path = folder / "a.mcap"
+            stage = running.enter_context(staged(folder, scenario, *faults))
             if plain:  # python-can's own socketcand: the robot isn't asked who it is
                 stage.on += "&plain=yes"
-            with stage.replay(recorded, path) as controller:
-                yield Driving(stage, controller, path)
+            return stage, running.enter_context(stage.replay(recorded, path)), path
 
-    return start
+        return closing(Driving(start))
+
+    return started
 
 
 def errors(written):
@@ -154,7 +171,12 @@ def test_a_process_that_comes_late_does_not_jump(driving):
         drive.signal(signal.SIGCONT)
         _, err, written = drive.ended()
     assert err.startswith("error: a control tick was 2.")
-    assert "s late, more than 1.5 s; the joints were brought straight within " in err
+    # What came meanwhile is found at once; on a busy machine the bus may seem silent for a moment.
+    assert re.search(
+        r"s late, more than 1\.5 s; (the servos held for \S+ s, then )?the joints were brought "
+        r"straight within ",
+        err,
+    )
     check_told(written, "a control tick was 2.")
     gate_stage.check_ramp_down(written, "fault: ")
 
@@ -298,7 +320,7 @@ def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_pa
         streams = {"stdin": slave, "stdout": slave, "stderr": slave, "start_new_session": True}
         with process(*words, **streams) as controller:
             os.close(slave)
-            drive = Driving(on_stage, controller, path)
+            drive = Driving(lambda _: (on_stage, controller, path))
             drive.begun(60)
             shown = b""
             while b"wave.mcap" not in shown:  # a progress bar is on it

@@ -180,8 +180,13 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, run
     assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
     waiting = live.replies(JOINTS)  # while it waits its servos tell where they are
     np.testing.assert_array_equal(positions(robot, waiting), np.zeros(JOINTS))
+    last_ns = 0
     while int(waiting["t_device_ns"][0]) < served.start_ns:
+        # Straight, whatever it has been commanded by then.
+        np.testing.assert_array_equal(positions(robot, waiting), np.zeros(JOINTS))
+        last_ns = int(waiting["t_device_ns"][0])
         waiting = live.replies(JOINTS)
+    assert last_ns == served.start_ns - 1000  # told at tick 1, the first cycle is told at tick 2
     frames = np.concatenate([waiting, live.replies(30 * JOINTS)])
     cycles = frames["t_device_ns"].reshape(-1, JOINTS).astype(np.int64) - served.start_ns
     stood_still = round(served.pace.stood_still_s * 1e9)
