@@ -170,24 +170,26 @@ def test_commands_in_steps_are_the_same_in_process(scenario):
 
 
 def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, running):
-    live = running(scenario.changed(duration_s=0.3), fast=False, wait=True)
-    time.sleep(0.3)
-    assert live.pacer.tally.ticks == 0
-    before = live.pacer.now_ns()
-    live.command([0.1] * JOINTS)
-    served = live.ended()
-    assert served.complete
-    assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
-    waiting = live.replies(JOINTS)  # while it waits its servos tell where they are
-    np.testing.assert_array_equal(positions(robot, waiting), np.zeros(JOINTS))
-    last_ns = 0
-    while int(waiting["t_device_ns"][0]) < served.start_ns:
-        # Straight, whatever it has been commanded by then.
-        np.testing.assert_array_equal(positions(robot, waiting), np.zeros(JOINTS))
-        last_ns = int(waiting["t_device_ns"][0])
-        waiting = live.replies(JOINTS)
-    assert last_ns == served.start_ns - 1000  # told at tick 1, the first cycle is told at tick 2
-    frames = np.concatenate([waiting, live.replies(30 * JOINTS)])
+    for _ in range(3):
+        live = running(scenario.changed(duration_s=0.3), fast=False, wait=True)
+        time.sleep(0.3)
+        assert live.pacer.tally.ticks == 0
+        before = live.pacer.now_ns()
+        live.command([0.1] * JOINTS)
+        served = live.ended()
+        assert served.complete
+        assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
+        resting, first = [], live.replies(JOINTS)
+        while int(first["t_device_ns"][0]) < served.start_ns:
+            resting.append(first)
+            first = live.replies(JOINTS)
+        if int(first["t_device_ns"][0]) == served.start_ns:
+            break  # else a busy machine slept past tick 0, and the last pose at rest came after it
+    for frames in resting:  # straight, whatever it has been commanded by then
+        np.testing.assert_array_equal(positions(robot, frames), np.zeros(JOINTS))
+    # The last pose at rest is sent at tick 1, the first cycle at tick 2.
+    assert int(resting[-1]["t_device_ns"][0]) == served.start_ns - 1000
+    frames = np.concatenate([first, live.replies(30 * JOINTS)])
     cycles = frames["t_device_ns"].reshape(-1, JOINTS).astype(np.int64) - served.start_ns
     stood_still = round(served.pace.stood_still_s * 1e9)
     assert cycles[0, 0] == 0
