@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from ..scenario.bus_faults import BusFault
     from ..scenario.scenario import Scenario
+    from ..serve.pacing import Pacer
     from ..serve.robot import Served
     from ..serve.socketcand_server import SocketcandServer, VirtualBus
 
@@ -128,20 +129,26 @@ def _run_feetech(scenario: Scenario, path: Path, *, wait: bool, json: bool) -> i
         name, count = scenario.robot.name, len(scenario.robot.joints)
         ready = {"event": "ready", "robot": name, "port": port, "listen": listen, "waits": wait}
         line = f"{name} is {count} STS3215 servos at {port}; listen at {listen}"
+
+        def announce() -> None:
+            facts = ready | {"priority": robot.pacer.raise_priority()}
+            echo(*([dumps(facts)] if json else [line]))
+
         try:
-            duration_s = robot.run(lambda: echo(*([dumps(ready)] if json else [line])), stop)
+            duration_s = robot.run(announce, stop)
         finally:
+            robot.pacer.lower_priority()
             robot.ports.close()
             _complain(events.flush())
     facts = {
         "event": "end",
         "duration_s": duration_s,
-        **asdict(robot.pace),
+        **asdict(robot.pacer.tally),
         "commands": robot.chain.commands,
         "bytes_received": robot.ports.received,
         "bytes_sent": robot.ports.sent,
     }
-    late = f"{1e3 * robot.pace.worst_s:.2g} ms late at worst"
+    late = f"{1e3 * robot.pacer.tally.worst_s:.2g} ms late at worst"
     line = f"{name} ran for {duration_s:g} s, {late}; {robot.chain.commands} commands taken"
     echo(*([dumps(facts)] if json else [line]))
     return 0
@@ -192,8 +199,9 @@ def _run(plan: _Plan) -> int:
                 stop=stop,
             )
             address = server.address if server else None
-            served = robot.run(lambda: _print_ready(plan, address, pacer.epoch_ns))
+            served = robot.run(lambda: _print_ready(plan, address, pacer))
         finally:
+            pacer.lower_priority()
             bus.close()
             _complain(events.flush())
     _print_end(plan, served, bus, server, sender)
@@ -209,7 +217,9 @@ def _print(plan: _Plan, facts: dict[str, Any], lines: list[str]) -> None:
     echo(*([dumps(facts)] if plan.json else lines))
 
 
-def _print_ready(plan: _Plan, address: tuple[str, int] | None, epoch_ns: int) -> None:
+def _print_ready(plan: _Plan, address: tuple[str, int] | None, pacer: Pacer) -> None:
+    # The twin is built by now. In lockstep the controller waits for it, however long it takes.
+    priority = None if plan.lockstep else pacer.raise_priority()
     host, port = address or (None, None)
     robot = plan.scenario.robot.name
     facts = {
@@ -221,7 +231,8 @@ def _print_ready(plan: _Plan, address: tuple[str, int] | None, epoch_ns: int) ->
         "port": port,
         "unix": str(plan.unix) if plan.unix is not None else None,
         "waits": plan.wait,
-        "epoch_ns": None if plan.fast else epoch_ns,
+        "epoch_ns": None if plan.fast else pacer.epoch_ns,
+        "priority": priority,
     }
     places = [f"{host}:{port}"] if address else []
     places += [str(plan.unix)] if plan.unix is not None else []

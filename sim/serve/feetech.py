@@ -41,7 +41,7 @@ from ..physics.sensing import JointSample, SensorSample
 from ..scenario.scenario import Scenario
 from ..twin.recording import quick_collections
 from ..twin.twin import Twin
-from .pacing import Pacer, PaceTally
+from .pacing import Pacer
 
 _REGISTERS = {one.quantity: one for one in SERVOS["feetech"]["sts3215"]}
 _MEMORY = 128
@@ -199,7 +199,11 @@ class ServoPorts:
 
 
 class FeetechRobot:
-    """The twin behind the ports; as a :class:`.Gait` it hands the driver's angles to it."""
+    """The twin behind the ports; as a :class:`.Gait` it hands the driver's angles to it.
+
+    Attributes:
+        pacer: Its clock, and how well it kept up with real time.
+    """
 
     names: tuple[str, ...] = ()
 
@@ -220,15 +224,10 @@ class FeetechRobot:
         self._scenario, self._wait, self._say = scenario, wait, log_event
         self.chain = ServoChain(scenario.robot)
         self.ports = ServoPorts(path, self.chain)
-        self._pacer = Pacer(10**9 // CONTROL_RATE_HZ)
+        self.pacer = Pacer(10**9 // CONTROL_RATE_HZ)
         self._tick = 0
         self._twin: Twin | None = None
         self._stop = StopRequest()
-
-    @property
-    def pace(self) -> PaceTally:
-        """How well it kept up with real time."""
-        return self._pacer.tally
 
     def run(self, ready: Callable[[], None], stop: StopRequest) -> float:
         """Run until the scenario ends or a stop is requested; return the simulated time [s].
@@ -249,7 +248,7 @@ class FeetechRobot:
     def step(self, time_s: float, readings: Readings) -> GaitTick:
         """Serve the line until the tick is due; then report, and take the newest angles."""
         del time_s, readings
-        tick, pacer = self._tick, self._pacer
+        tick, pacer = self._tick, self.pacer
         if not tick:
             while self._wait and not self.chain.commands and not self._stop.requested:
                 self.ports.pump(0.05)

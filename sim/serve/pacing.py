@@ -6,6 +6,9 @@ needs longer than a period for a period is behind, and catches up where it can. 
 simulated time stands still and the ticks that follow are due later: samples then have a gap on the
 robot's clock, which a recording shows and its health check tells. Samples that are on their way by
 then come after the gap, so that no time on the bus ever goes back.
+
+A robot is no program that waits for a processor: while it keeps to the clock it may have a raised
+priority, as the recorder and an armed drive have.
 """
 
 from __future__ import annotations
@@ -14,10 +17,12 @@ import ipaddress
 import socket
 import time
 from bisect import bisect_left, bisect_right
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.process import raised_priority
 
 
 def listen_on_loopback(host: str, port: int) -> socket.socket:
@@ -58,6 +63,7 @@ old when they come; together that stays below the 0.1 s by which a recorder tell
 late from a clock that was set back."""
 
 _ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
+_TOO_SLOW_S = 1.0  # a twin that stood still for so long would take a core from everything else
 
 
 @dataclass
@@ -101,6 +107,7 @@ class Pacer:
         self._present_ns = 0
         self._from_tick = [0]  # where simulated time stood still, and tick 0 as seen from there on
         self._start_ns = [0]
+        self._priority = ExitStack()
 
     @property
     def start_ns(self) -> int:
@@ -119,6 +126,20 @@ class Pacer:
                 socketcand has no finer times.
         """
         self._start_ns[0] = self._present_ns if self._fast else _whole_us(start_ns)
+
+    def raise_priority(self) -> str:
+        """Raise the priority of this process's threads, so that a busy computer stops no tick.
+
+        Until :meth:`lower_priority`, or until the twin turns out to be slower than real time.
+
+        Returns:
+            The priority, or that it was refused.
+        """
+        return self._priority.enter_context(raised_priority()).text
+
+    def lower_priority(self) -> None:
+        """Lower it again; safe to call twice."""
+        self._priority.close()
 
     def clock_ns(self, elapsed_ns: int) -> int:
         """The robot's clock at a moment of simulated time [ns].
@@ -154,6 +175,8 @@ class Pacer:
         place = bisect_left(self._from_tick, first)
         self._from_tick[place:], self._start_ns[place:] = [first], [start_ns]
         tally.stood_still_s += late_ns / NS
+        if tally.stood_still_s > _TOO_SLOW_S:
+            self.lower_priority()
         return late_ns / NS
 
 

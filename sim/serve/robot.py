@@ -1,9 +1,9 @@
 """The virtual robot: the twin, commanded over its bus and reporting there.
 
-At each control tick what the sensors have told by then goes out first, and then the newest commands
-are latched. In lockstep a controller thus closes its loop within the tick, as one in process does;
-in real time its answer counts from the next tick on. The frames of a tick go out in one burst;
-their device times are the sampling times.
+At each control tick what the sensors have reported by then is sent first, and then the newest
+commands are latched. In lockstep a controller thus closes its loop within the tick, as one in
+process does; in real time its answer counts from the next tick on. The frames of a tick go out in
+one burst; their device times are the sampling times.
 """
 
 from __future__ import annotations
@@ -120,8 +120,8 @@ class CommandLatch:
 PERIOD_NS = NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
-_BEFORE_NS = 1_000_000  # the last pose that is told before tick 0
-_JUST_BEFORE_NS = 1000  # that which is told after it: what a time on the bus is rounded to
+_BEFORE_NS = 1_000_000  # the last pose that is sent before tick 0
+_JUST_BEFORE_NS = 1000  # the one sent after it: times on the bus are rounded to this
 _NAMED = 8
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
@@ -240,7 +240,7 @@ class VirtualRobot:
         """Wait for the tick, report, and take the newest commands."""
         tick = self._tick
         if not tick:
-            # Nothing is told before it: a controller in lockstep may speak, and knows the pose.
+            # Nothing is sent before it: a controller in lockstep may speak, and knows the pose.
             self._bus.mark(0, self._at_rest(self._pacer.now_ns()))
             self._begin()
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
@@ -269,18 +269,20 @@ class VirtualRobot:
             self._pacer.start(self._pacer.now_ns())
         elif self._wait_for_commands:
             due_ns = self._pacer.now_ns()
-            while not self._latch.frames:  # until then the servos tell where they are
+            while not self._latch.frames:  # until then the servos report their angles
                 if (late_ns := self._pacer.now_ns() - due_ns) >= 0:
                     self._bus.send(self._at_rest(self._pacer.now_ns()))
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
                 self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / NS))
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             start_ns = self._pacer.now_ns() + PERIOD_NS // 2
-            # The first cycle of the servos is told at tick 2. Until then their pose before it is
-            # told, here and at tick 1: else it is a long silence.
+            # The first cycle of the servos is sent at tick 2. Their pose before it is sent here and
+            # at tick 1: without them the bus would be silent for three control periods.
             while (left_ns := start_ns - _BEFORE_NS - self._pacer.now_ns()) > 0:
                 self._serve(left_ns / NS)
-            self._bus.send(self._at_rest(self._pacer.now_ns()))
+            # Before tick 0 also where this process slept past it: times on the bus never go back.
+            t_ns = min(self._pacer.now_ns(), start_ns - 2 * _JUST_BEFORE_NS)
+            self._bus.send(self._at_rest(t_ns))
             self._pacer.start(start_ns)
         else:
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS)

@@ -9,7 +9,7 @@ import math
 import signal
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import can
@@ -170,6 +170,49 @@ def staged(folder, scenario, *faults, pace="--wait"):
             assert listener.stdout.readline() == "listening\n", listener.stderr.read()
             where = ready["bus"], ready["port"]
             yield Stage(robot, *where, listener, heard, lockstep=pace == "--lockstep")
+
+
+class Driving:
+    """A drive over the bus of the small robot, with a listener."""
+
+    def __init__(self, start):
+        self._start, self._running = start, ExitStack()
+        self._anew()
+
+    def _anew(self):
+        self._running.close()
+        self.stage, self.controller, self.path = self._start(self._running)
+
+    def begun(self, count=150):
+        """Wait until so many ticks were commanded; on a machine that stops for 30 ms begin anew."""
+        for left in (2, 1, 0):
+            try:
+                self.stage.wait_for_commands(self.controller, count)
+                break
+            except AssertionError as error:
+                if not left or "the bus was silent" not in str(error):
+                    raise
+            self._anew()
+
+    def close(self):
+        self._running.close()
+
+    def signal(self, number, pause_s=0.0):
+        self.controller.send_signal(number)
+        time.sleep(pause_s)
+
+    def communicate(self):
+        out, err = self.controller.communicate(timeout=60)
+        self.stage.settle()
+        return out, err
+
+    def ended(self, code=1):
+        """Wait for the end, and check all of it; returns output, errors and the session."""
+        out, err = self.communicate()
+        assert self.controller.returncode == code, (out, err)
+        lines = self.stage.lines
+        check_limits(lines)
+        return out, err, check_session(self.path, lines)
 
 
 # -- what was on the bus ------------------------------------------------------------------------

@@ -39,16 +39,15 @@ def check_kept(written, lines):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, small, session, tmp_path):
-    path, repaired = tmp_path / "a.mcap", tmp_path / "repaired.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller, 80)
+def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, driving, session, tmp_path):
+    repaired = tmp_path / "repaired.mcap"
+    with driving() as drive:
+        drive.begun(80)
         time.sleep(random.Random(seed).uniform(0.0, 1.5))
-        controller.kill()
-        controller.communicate(timeout=20)
-        on_stage.settle()
-        lines = on_stage.lines
-        again = undulog(*on_stage.words(session, path)[len(UNDULOG) :])
+        drive.controller.kill()
+        drive.communicate()
+        path, lines = drive.path, drive.stage.lines
+        again = undulog(*drive.stage.words(session, path)[len(UNDULOG) :])
     assert again.returncode == 2
     assert "exists already" in again.stderr
     with Session.open(path) as left:
@@ -102,18 +101,17 @@ def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
     return err, written
 
 
-def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, tmp_path, disk_of):
+def test_a_disk_that_somebody_fills_brings_the_robot_down_first(driving, disk_of):
     disk = disk_of("64m")
-    path = disk / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller)
+    with driving(disk=disk) as drive:
+        drive.begun()
         fill(disk)
-        err, _ = check_told(controller, path, disk)
-        on_stage.settle()
-        lines = on_stage.lines
-    assert "No space left on device" in err
-    gate_stage.check_limits(lines)
-    gate_stage.check_session(path, lines)
+        err, _ = check_told(drive.controller, drive.path, disk)
+        drive.stage.settle()
+        lines = drive.stage.lines
+        assert "No space left on device" in err
+        gate_stage.check_limits(lines)
+        gate_stage.check_session(drive.path, lines)
 
 
 def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of):

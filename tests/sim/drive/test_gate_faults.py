@@ -10,80 +10,18 @@ import pty
 import re
 import signal
 import sys
-import tempfile
-import time
-from contextlib import ExitStack, closing
-from pathlib import Path
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
 from support import gate_stage
-from support.gate_stage import SAFETY, Written, staged
+from support.gate_stage import SAFETY, Driving, Written, staged
 from support.processes import process
 
 NOTHING_MORE = "nothing more was sent; the servos hold their last commands"
 FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
 ERROR = 40  # of rcl_interfaces/msg/Log
-
-
-class Driving:
-    """A drive over the bus of the small robot, with a listener."""
-
-    def __init__(self, start):
-        self._start, self._running = start, ExitStack()
-        self._anew()
-
-    def _anew(self):
-        self._running.close()
-        self.stage, self.controller, self.path = self._start(self._running)
-
-    def begun(self, count=150):
-        """Wait until so many ticks were commanded; on a machine that stops for 30 ms begin anew."""
-        for left in (2, 1, 0):
-            try:
-                self.stage.wait_for_commands(self.controller, count)
-                break
-            except AssertionError as error:
-                if not left or "the bus was silent" not in str(error):
-                    raise
-            self._anew()
-
-    def close(self):
-        self._running.close()
-
-    def signal(self, number, pause_s=0.0):
-        self.controller.send_signal(number)
-        time.sleep(pause_s)
-
-    def communicate(self):
-        out, err = self.controller.communicate(timeout=60)
-        self.stage.settle()
-        return out, err
-
-    def ended(self, code=1):
-        """Wait for the end, and check all of it; returns output, errors and the session."""
-        out, err = self.communicate()
-        assert self.controller.returncode == code, (out, err)
-        lines = self.stage.lines
-        gate_stage.check_limits(lines)
-        return out, err, gate_stage.check_session(self.path, lines)
-
-
-@pytest.fixture
-def driving(small, session, tmp_path):
-    def started(*faults, scenario=small[1], recorded=session, plain=False):
-        def start(running):
-            folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a test may drive several times
-            path = folder / "a.mcap"
-            stage = running.enter_context(staged(folder, scenario, *faults))
-            if plain:  # python-can's own socketcand: the robot isn't asked who it is
-                stage.on += "&plain=yes"
-            return stage, running.enter_context(stage.replay(recorded, path)), path
-
-        return closing(Driving(start))
-
-    return started
 
 
 def errors(written):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import signal
 import socket
@@ -243,6 +244,8 @@ def test_it_ends_in_good_order(number, tmp_path):
     words = ("--wait", "--unix", str(tmp_path / "bus.sock")) if number is signal.SIGINT else ()
     with serving("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
         assert ready["waits"] is bool(words)
+        policy = os.sched_getscheduler(robot.pid) & ~os.SCHED_RESET_ON_FORK
+        assert (ready["priority"] == "SCHED_RR 1") == (policy == os.SCHED_RR)
         with socket.create_connection((ready["host"], ready["port"])) as client:
             assert client.recv(100) == b"< hi >"
             client.sendall(b"< open can0 >< rawmode >")
