@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from .errors import UsageError
 
 if TYPE_CHECKING:
+    import threading
     from concurrent.futures import ThreadPoolExecutor
 
 _NICE = -10  # requested where real-time priority is refused
@@ -92,6 +93,28 @@ def _set(thread: int, policy: int, nice: int) -> None:
 
 def _named(policy: int, nice: int) -> str:
     return f"nice {nice}" if policy == os.SCHED_OTHER else f"policy {policy}"
+
+
+_JOIN_SLICES = 20
+
+
+def join_running(thread: threading.Thread, limit_s: float) -> bool:
+    """Wait for the end of a thread for a time in which this process runs.
+
+    While the process is stopped (SIGSTOP, a suspended computer) the thread can't end, and that time
+    doesn't count.
+
+    Args:
+        limit_s: Time limit [s].
+
+    Returns:
+        Whether it has ended.
+    """
+    for _ in range(_JOIN_SLICES):
+        thread.join(limit_s / _JOIN_SLICES)
+        if not thread.is_alive():
+            return True
+    return False
 
 
 _MOST_BY_DEFAULT = 4
@@ -217,6 +240,8 @@ class StopRequest:
         self.signal: signal.Signals | None = None
         self.again = False
         """Whether a stop was requested a second time."""
+        self.continued = 0
+        """How often the process was continued (SIGCONT) after it had been suspended."""
 
     @property
     def requested(self) -> bool:
@@ -239,7 +264,7 @@ def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
         The request; look at ``requested`` between two samples.
     """
     request = StopRequest()
-    former = {number: signal.getsignal(number) for number in _SIGNALS}
+    former = {number: signal.getsignal(number) for number in (*_SIGNALS, signal.SIGCONT)}
 
     def note(number: int, _frame: FrameType | None) -> None:
         kind = signal.Signals(number)
@@ -248,7 +273,12 @@ def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
         if not twice or (request.again and kind is not signal.SIGHUP):
             signal.signal(number, former[kind])
 
+    def count(_number: int, _frame: FrameType | None) -> None:
+        request.continued += 1
+
     try:
+        if former[signal.SIGCONT] is signal.SIG_DFL:
+            signal.signal(signal.SIGCONT, count)
         for number in _SIGNALS:
             if former[number] is not signal.SIG_IGN:  # nohup stays in force
                 signal.signal(number, note)

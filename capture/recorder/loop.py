@@ -21,9 +21,10 @@ from ..log.messages.frames import FD_FRAME_DTYPE, FRAME_DTYPE, FrameArray
 from ..log.write.channels import TimeReferenceChannel
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
-from ..sources.contract import EndingSource, Polled, Source, SourceContext
+from ..sources.contract import ConnectedSource, EndingSource, Polled, Source, SourceContext
 from ..sources.serial_port import SerialSource
 from .bus_recorder import BusRecorder
+from .pauses import Pause, PauseWatch
 from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
 
@@ -41,7 +42,20 @@ _PRESSED = 1000
 buffers hold only milliseconds of a burst."""
 
 _PAUSE_NS = 1_000_000
+_CATCH_UP_NS = 5_000_000_000
+"""Time to receive what waits at the end, without the pauses of the process: a connection of
+1 MB/s brings the 4 MB of a server's buffer."""
+
+_CALM = 3
+"""So many ticks without a burst: nothing waits any more. TCP may delay an acknowledgement, and so
+what waits at the far end, by 40 ms (``TCP_DELACK_MIN`` of Linux)."""
+
 _DRAIN_NS = 500_000_000
+"""Time for frames from before the end to arrive, without the pauses of the process."""
+
+_STEP_NS = 20_000_000
+"""A longer step at the end was a pause of the process, in which nothing could arrive."""
+
 _MOST_WAITING = 2_000_000
 """With more frames to decode (64 MB), decoding no longer waits for the end of a burst."""
 
@@ -115,6 +129,7 @@ class Recorder:
         self._odd_clocks: set[str] = set()
         self._reported_ids: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
+        self._pauses: PauseWatch | None = None
 
     def on_event(self, listener: Callable[[int, str, str, str], None]) -> None:
         """Set a listener, called after each event: time [Unix ns], level, name, text."""
@@ -156,9 +171,11 @@ class Recorder:
                 _manual_collection()
             ):  # first: it takes long, and the buffers of sources that listen fill
                 self._start()
+                self._pauses = PauseWatch(time.monotonic_ns(), lambda: stop.continued)
                 with self._urgent():
-                    self._loop(stop, duration_s)
-                    self._drain()
+                    self._loop(stop, duration_s, self._pauses)
+                    self._catch_up(self._pauses)
+                    self._drain(self._pauses)
             self._finish()
         finally:
             for source in self._sources:
@@ -198,12 +215,13 @@ class Recorder:
                 )
             yield
 
-    def _loop(self, stop: StopRequest, duration_s: float | None) -> None:
+    def _loop(self, stop: StopRequest, duration_s: float | None, pauses: PauseWatch) -> None:
         begun_ns = due_ns = time.monotonic_ns()
         end_ns = None if duration_s is None else begun_ns + round(duration_s * _NS)
-        tick = 0
+        tick = planned_ns = 0
         while self.ending is None:
             now_ns = time.monotonic_ns()
+            pauses.look(now_ns, planned_ns)
             self._tick(tick, now_ns)
             if stop.signal is not None:
                 self.ending = Ending(f"{stop.signal.name} was received")
@@ -213,18 +231,19 @@ class Recorder:
                 self.ending = Ending("all sources have ended", failed=bool(self._failed))
             after_ns = time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
+            pauses.look(after_ns)
+            self._report_pauses(pauses)
             tick += 1
             due_ns = after_ns + _PAUSE_NS if self._received >= _PRESSED else due_ns + TICK_NS
-            if after_ns < due_ns:
-                select([], [], [], (due_ns - after_ns) / _NS)
+            planned_ns = max(0, due_ns - after_ns)
+            if planned_ns:
+                select([], [], [], planned_ns / _NS)
             elif after_ns > due_ns + _NS:  # stopped for a while: left-out ticks are not repeated
                 self.overruns += (after_ns - due_ns) // TICK_NS
                 due_ns = after_ns
 
     def _tick(self, tick: int, now_ns: int) -> None:
-        self._poll()
-        for bus in self.buses.values():
-            bus.write_raw(self._clock.now_ns)
+        self._take()
         waits = self.backlog
         pressed = self._received >= _PRESSED and waits < _MOST_WAITING
         every = WATCHED_TICKS if self.watched else DECODE_TICKS
@@ -238,7 +257,42 @@ class Recorder:
         for each in self._each_tick:
             each()
 
-    def _drain(self) -> None:
+    def _catch_up(self, pauses: PauseWatch) -> None:
+        """Receive what was sent over connections before: the end comes after it.
+
+        A connection holds more than this computer's buffer: the rest waits at the far end, and
+        arrives as that is emptied. Senders to an :class:`EndingSource` are refused instead.
+        """
+        if all(isinstance(source, EndingSource) or source.robot for source in self._sources):
+            return
+        before_ns = time.monotonic_ns()
+        left_ns, calm = _CATCH_UP_NS, 0
+        while calm < _CALM and left_ns > 0:
+            select([], [], [], TICK_NS / _NS)
+            self._take()
+            now_ns = time.monotonic_ns()
+            pauses.look(now_ns, TICK_NS)
+            left_ns -= min(now_ns - before_ns, 2 * TICK_NS)
+            before_ns = now_ns
+            calm = 0 if self._received >= _PRESSED else calm + 1
+
+    def _take(self) -> None:
+        """Write the new frames of all sources."""
+        self._poll()
+        for bus in self.buses.values():
+            bus.write_raw(self._clock.now_ns)
+
+    def _report_pauses(self, pauses: PauseWatch, *, ends: bool = False) -> None:
+        dropped = {source.name: source.counts.dropped for source in self._sources}
+        for text in pauses.report(dropped, ends=ends):
+            self.log_event("warn", "recorder", text)
+
+    @property
+    def pauses(self) -> Sequence[Pause]:
+        """Times in which the process did not run."""
+        return () if self._pauses is None else tuple(self._pauses.pauses)
+
+    def _drain(self, pauses: PauseWatch) -> None:
         """End at this instant: frames before it are kept, later ones are left out.
 
         An :class:`EndingSource` refuses frames from now on. Of another source a later frame proves
@@ -248,15 +302,24 @@ class Recorder:
         for source in self._sources:
             if source.name not in self._failed:
                 self._end_source(source)
-        until_ns = self._end_ns + _DRAIN_NS
+        left_ns, before_ns, before = _DRAIN_NS, time.monotonic_ns(), self._from_ended()
         while True:
-            self._poll()
-            for bus in self.buses.values():
-                bus.write_raw(self._clock.now_ns)
-            late = self._clock.now_ns() >= until_ns
-            if late or not any(self._has_more(source) for source in self._sources):
-                return
+            self._take()
+            now_ns = time.monotonic_ns()
+            pauses.look(now_ns)
+            count = self._from_ended()
+            if count > before:  # the kernel's buffers limit what still comes
+                left_ns, before = _DRAIN_NS, count
+            left_ns -= min(now_ns - before_ns, _STEP_NS)
+            before_ns = now_ns
+            if left_ns <= 0 or not any(self._has_more(source) for source in self._sources):
+                break
             select([], [], [], _PAUSE_NS / _NS)
+        self._report_pauses(pauses, ends=True)
+
+    def _from_ended(self) -> int:
+        """Return the number of frames so far of the sources that take no new ones."""
+        return sum(s.counts.frames for s in self._sources if isinstance(s, EndingSource))
 
     def _has_more(self, source: Source) -> bool:
         """Whether frames from before the end may still come."""
@@ -290,6 +353,12 @@ class Recorder:
             return frames
         self._later.add(source.name)
         return frames[before]
+
+    @property
+    def lost_links(self) -> list[str]:
+        """Names of the sources whose connection broke and has not come back."""
+        sources = (source for source in self._sources if isinstance(source, ConnectedSource))
+        return sorted(source.name for source in sources if source.lost)
 
     @property
     def given_up(self) -> list[str]:

@@ -397,7 +397,7 @@ class Recording:
         return facts
 
     def _recorder_facts(self, ending: Ending) -> dict[str, str]:
-        times = self._recorder.ticks.result()
+        times, pauses = self._recorder.ticks.result(), self._recorder.pauses
         return {
             "ended": ending.reason,
             "priority": self._recorder.priority.text,
@@ -406,6 +406,8 @@ class Recording:
             "tick_p99_s": f"{times.p99_s:.3g}",
             "tick_max_s": f"{times.max_s:.3g}",
             "ticks_left_out": str(self._recorder.overruns),
+            "pauses": str(len(pauses)),
+            "paused_s": f"{sum(pause.ended_ns - pause.began_ns for pause in pauses) / NS:.3f}",
         }
 
     # -- facts -------------------------------------------------------------------------------
@@ -428,9 +430,13 @@ class Recording:
     def _report(self, ending: Ending) -> RecordReport:
         measures = self._health.result()
         files = self._storage.files()
-        if (lost := self._recorder.given_up) and not ending.failed:
-            what = f"{ending.reason}; given up before, see /rosout: {', '.join(lost)}"
-            ending = Ending(what, failed=True)
+        for what, lost in (
+            ("given up before", self._recorder.given_up),
+            ("lost and not back", self._recorder.lost_links),
+        ):
+            if lost:
+                text = f"{ending.reason}; {what}, see /rosout: {', '.join(lost)}"
+                ending = Ending(text, failed=True)
         return RecordReport(
             files=files,
             session_id=self._session_id,

@@ -15,6 +15,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import cast
 
 import can
@@ -23,6 +24,7 @@ from can.interfaces import BACKENDS
 from can.util import cast_from_string
 
 from ..common.errors import SourceError, UsageError
+from ..common.process import join_running
 from ..common.strict_table import listed
 from ..log.messages import frames as wire
 from ..log.messages.frames import FrameArray, empty_fd_frames, empty_frames
@@ -98,21 +100,29 @@ class PythonCanLink:
         """End the thread, which closes the bus."""
         self._stop.set()
         if threading.current_thread() is not self._thread:
-            self._thread.join(_JOIN_S)
+            join_running(self._thread, _JOIN_S)
+
+    def _receive(self, wait_s: float) -> bool:
+        """Receive one message; return whether one came within the time [s]."""
+        message = self._bus.recv(wait_s)
+        if message is None:
+            return False
+        if len(self._held) < _MOST_HELD:
+            self._held.append((self._tally.now_ns(), message))
+        else:
+            self._lost += 1
+        return True
 
     def _run(self) -> None:
         lost: OSError | None = None
         try:
             while not self._stop.is_set():
-                message = self._bus.recv(_WAIT_S)
-                if message is None:
-                    continue
-                if len(self._held) < _MOST_HELD:
-                    self._held.append((self._tally.now_ns(), message))
-                else:
-                    self._lost += 1
+                self._receive(_WAIT_S)
         except Exception as error:  # noqa: BLE001 (a driver's fault is the end of its connection)
             lost = failure(error)
+            with suppress(Exception):  # what the driver still holds
+                while self._receive(0.0):
+                    pass
         try:
             self._bus.shutdown()
         except Exception as error:  # noqa: BLE001 (a dead device can't be closed: it is lost)

@@ -224,6 +224,16 @@ class Source(Protocol):
 
 
 @runtime_checkable
+class ConnectedSource(Protocol):
+    """A source over a connection that may break; it is tried again."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection broke, and has not come back."""
+        ...
+
+
+@runtime_checkable
 class EndingSource(Protocol):
     """A source that can end at an instant: its senders get an error from then on."""
 

@@ -150,6 +150,7 @@ class LinkedSource:
         self._link: Link | None = None
         self._was_up = False
         self._lost_ns: int | None = None
+        self._lost = False
         self._complaint = ""
 
     @property
@@ -161,6 +162,11 @@ class LinkedSource:
     def connected(self) -> bool:
         """Whether the connection is open."""
         return self._link is not None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection broke, and has not come back."""
+        return self._lost
 
     def start(self, context: SourceContext) -> None:
         """Begin to connect, and wait a moment for the result.
@@ -243,7 +249,7 @@ class LinkedSource:
             away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
             text = f"{self._place} is back after {away_s:.1f} s"
         self._tally.events.log_event("info", text + (f" ({link.detail})" if link.detail else ""))
-        self._was_up = True
+        self._was_up, self._lost = True, False
 
     def _read(self, now_ns: int) -> tuple[FrameArray, ...]:
         if self._link is None:
@@ -256,7 +262,7 @@ class LinkedSource:
             reason = repr(error)
         self._link.close()
         self._link = None
-        self._lost_ns = now_ns
+        self._lost_ns, self._lost = now_ns, True
         self._backoff.failed(now_ns)
         self._complain(f"lost {self._place}: {reason}")
         return ()

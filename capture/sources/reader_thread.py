@@ -4,11 +4,6 @@ Python's ``recv_into`` costs more than a microsecond a packet, and with the time
 that. One call for all received packets is several times cheaper, and a packet's time is that of its
 arrival, not of the call.
 
-The loop polls once a tick, and may be delayed by another program that has the processor, by a disk,
-or by decoding. A serial device or a raw CAN socket holds some ten or hundred milliseconds of a busy
-bus: :class:`DrainedLink` reads such a link in a thread, and stamps frames without a time closer to
-their arrival.
-
 An ``AF_UNIX`` socket holds 30 ms of a busy bus with one frame a packet. So the thread of
 :class:`ReceiveThread` gives the kernel room for up to a thousand packets in one ``recvmmsg`` that
 waits for them all: the kernel fills row after row as packets arrive, without Python code and
@@ -31,16 +26,14 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.process import share_priority
-from ..log.messages.frames import FrameArray
-from .events import Tally
-from .link import Link
+from ..common.process import join_running, share_priority
 
 SO_TIMESTAMPNS = 35
 """Socket option and control message: arrival as timespec (``asm-generic/socket.h``)."""
@@ -50,6 +43,13 @@ SO_SNDBUFFORCE = 32
 """Socket option: send buffer beyond the system's limit, for the superuser."""
 SO_RCVBUFFORCE = 33
 """Socket option: receive buffer beyond the system's limit, for the superuser."""
+
+INTERRUPTED = frozenset({errno.EINTR, *range(512, 517)})
+"""Errors of a call that a stop or a signal interrupted; it is made again.
+
+``recvmmsg`` that waits with packets in hand leaves the kernel's own code in the socket, ERESTARTSYS
+(512) after SIGSTOP, and the next call returns it (``net/socket.c``, ``do_recvmmsg``;
+``include/linux/errno.h`` has 512 to 516)."""
 
 _CONTROL = 128
 _EMPTY = 2**32 - 1  # no packet has this size
@@ -137,11 +137,14 @@ class ReceiveMany:
         """
         return self.batch(0, self._received(fileno, socket.MSG_DONTWAIT))
 
-    def fill(self, fileno: int) -> int:
+    def fill(self, fileno: int, *, waiting: bool = True) -> int:
         """Wait for packets in the kernel, the interpreter's lock released, until all rows are full.
 
         Meanwhile another thread gets the received packets by :meth:`arrived` and :meth:`batch`.
         :meth:`clear` must be called before.
+
+        Args:
+            waiting: Whether to wait; else the packets that the kernel has now.
 
         Returns:
             Number of filled rows: fewer after a signal or before an error.
@@ -149,7 +152,7 @@ class ReceiveMany:
         Raises:
             OSError: As ``recvmmsg`` has it.
         """
-        return self._received(fileno, 0)
+        return self._received(fileno, 0 if waiting else socket.MSG_DONTWAIT)
 
     def clear(self) -> None:
         """Empty the rows, before the next :meth:`fill`."""
@@ -200,7 +203,7 @@ class ReceiveMany:
         count = int(_RECVMMSG(ctypes.c_int(fileno), *self._call, ctypes.c_int(flags), None))
         if count < 0:
             code = ctypes.get_errno()
-            if code not in (errno.EAGAIN, errno.EINTR):
+            if code != errno.EAGAIN and code not in INTERRUPTED:
                 raise OSError(code, os.strerror(code))
             count = 0
         return count
@@ -266,89 +269,9 @@ def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> N
 
 
 _JOIN_S = 1.0
-_MOST_HELD = 2_000_000  # frames: 64 MB, four minutes of a busy bus
-
-
-class LinkWithFile(Link, Protocol):
-    """A link with a file descriptor to wait for."""
-
-    def fileno(self) -> int:
-        """Return its file descriptor."""
-        ...
-
-
-class DrainedLink:
-    """The :class:`.capture.sources.link.Link` that reads another one in a thread."""
-
-    def __init__(
-        self, link: LinkWithFile, tally: Tally, *, pause_s: float, longest_s: float | None = None
-    ) -> None:
-        """Take over an open link, and begin.
-
-        Args:
-            link: From now on, only the thread uses it.
-            tally: Counts lost frames; the link may have the same.
-            pause_s: Pause after each read [s]: frames without a time are stamped at most this much
-                later.
-            longest_s: Read again after so long without a byte [s], so that the link notices.
-        """
-        self.detail = link.detail
-        self._link, self._tally, self._pause_s = link, tally, pause_s
-        self._longest_s = longest_s
-        self._held: deque[FrameArray] = deque()
-        self._count = self._taken = 0
-        self._error: Exception | None = None
-        self._stop = threading.Event()
-        self._wake = os.pipe()
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="undulog-drain", daemon=True)
-        self._thread.start()
-
-    def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
-        """See :meth:`Link.read`."""
-        error = self._error  # before the frames: none comes after it
-        found: list[FrameArray] = []
-        while self._held:
-            found.append(self._held.popleft())
-            self._taken += len(found[-1])
-        if not found and error is not None:
-            raise error
-        return found
-
-    def close(self) -> None:
-        """End the thread and close the link."""
-        if self._closed:
-            return
-        self._closed = True
-        self._stop.set()
-        os.write(self._wake[1], b"x")
-        self._thread.join(_JOIN_S)
-        self._link.close()
-        for end in self._wake:
-            os.close(end)
-
-    def _run(self) -> None:
-        try:
-            fileno = self._link.fileno()
-            while not self._stop.is_set():
-                for frames in self._link.read(self._tally.now_ns()):  # some may be there already
-                    self._hold(frames)
-                self._stop.wait(self._pause_s)
-                select.select([fileno, self._wake[0]], [], [], self._longest_s)
-        except Exception as error:  # noqa: BLE001 (raised again by read(), in the recorder's thread)
-            self._error = error
-
-    def _hold(self, frames: FrameArray) -> None:
-        if self._count - self._taken + len(frames) > _MOST_HELD:
-            text = "frame dropped, as the recorder was held up for minutes"
-            self._tally.lost(text, len(frames), "error")
-            return
-        self._count += len(frames)
-        self._held.append(frames)
-
-
 _FEWEST, _MOST = 256, 1024  # rows; the kernel takes no more
 _BRIEF_S = 0.2  # rows that are full sooner become more
+_LAST_CALLS = 3  # without a packet: an error that waits in the socket, an interruption, the end
 _MOST_BYTES = 64 << 20  # so much may wait for the loop: then the kernel's buffer fills
 
 
@@ -441,7 +364,7 @@ class ReceiveThread:
         """End the thread and close the socket; safe to call twice."""
         self._closing.set()
         self.end()
-        self._thread.join(_JOIN_S)
+        join_running(self._thread, _JOIN_S)
         self._sock.close()
 
     def _run(self) -> None:
@@ -450,15 +373,25 @@ class ReceiveThread:
         share_priority()
         try:
             while not self._closing.is_set():
-                if len(self._filled) >= self._most_waiting:
-                    self._closing.wait(0.001)
-                    continue
-                if self._fill(self._next()) and _hung_up(self._sock):
+                received = self._fill(self._next())
+                # Empty packets are the end; none at all, an interrupted call.
+                if received and not any(received) and _hung_up(self._sock):
                     return
         except OSError as error:
             self.error = error
+            self._fetch_rest()
         finally:
             self._ended = True
+
+    def _fetch_rest(self) -> None:
+        """Fetch what a broken connection has in the kernel; senders are refused from now on."""
+        self.end()
+        calls_without = 0
+        while calls_without < _LAST_CALLS and not self._closing.is_set():
+            received: list[int] = []
+            with suppress(OSError):  # reported already: it broke the connection
+                received = self._fill(self._next(), waiting=False)
+            calls_without = 0 if any(received) else calls_without + 1
 
     def _next(self) -> _Rows:
         while self._free:
@@ -467,23 +400,24 @@ class ReceiveThread:
                 return rows
         return _Rows(self._rows, self._longest)
 
-    def _fill(self, rows: _Rows) -> bool:
-        """Wait for packets; return whether all were empty, as after a sender's last."""
+    def _fill(self, rows: _Rows, *, waiting: bool = True) -> list[int]:
+        """Receive packets; return their sizes [B], 0 behind a sender's last."""
+        while len(self._filled) >= self._most_waiting and not self._closing.wait(0.001):
+            pass
         self._filled.append(rows)
         begun = time.monotonic()
         count = 0
         try:
-            count = rows.room.fill(self._sock.fileno())
-        except ConnectionError as error:
-            self.error = error  # earlier packets are still to be fetched
+            count = rows.room.fill(self._sock.fileno(), waiting=waiting)
         finally:
             rows.count = count
         if count == self._rows and time.monotonic() - begun < _BRIEF_S:
             self._rows = min(self._rows * 4, _MOST)
-        return not any(rows.room.sizes(count))
+        return rows.room.sizes(count)
 
 
 def _hung_up(sock: socket.socket) -> bool:
     poll = select.poll()
     poll.register(sock.fileno(), select.POLLRDHUP)
-    return bool(poll.poll(0))
+    # An error that waits in the socket is reported, too; the next call returns it.
+    return any(state & (select.POLLRDHUP | select.POLLHUP) for _, state in poll.poll(0))

@@ -26,15 +26,15 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..common.errors import SourceError, UsageError
-from ..common.process import share_priority
+from ..common.process import join_running, share_priority
 from ..common.strict_table import listed
 from ..log.messages.frames import DIR_TX, SERIAL_MORE, SERIAL_NOISE, FrameArray
 from ..robot.model import ClockDomain
 from ..robot.serial_servos import PROTOCOLS, PacketSplitter
 from .contract import SourceAddress, fd_records, number, only, pack_fd_record
+from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
-from .reader_thread import DrainedLink
 
 DEFAULT_BAUD = 1_000_000
 """Of both families' servos in robots [bit/s]."""
@@ -192,7 +192,7 @@ class TapLink:
         if self._port is None:
             return
         self._stop.set()
-        self._thread.join(1.0)
+        join_running(self._thread, 1.0)
         for fileno in (self._port, self._master, self._slave):
             with suppress(OSError):
                 os.close(fileno)

@@ -38,9 +38,9 @@ from .contract import (
     pack_record,
     records,
 )
+from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
-from .reader_thread import DrainedLink
 from .serial_port import bauds, check_device, make_raw
 
 STAMP_PERIOD_MS = 60_000

@@ -19,6 +19,7 @@ from ..common.errors import SourceError, UsageError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
 from .contract import SourceAddress, flag, only
+from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import (
@@ -27,7 +28,6 @@ from .reader_thread import (
     SO_TIMESTAMPNS,
     ArrivalClock,
     Batch,
-    DrainedLink,
     ReceiveMany,
     enlarge_buffer,
 )
@@ -45,6 +45,7 @@ _CANFD_FRAME = np.dtype(
 _BUFFER_BYTES = 8 << 20
 _PACKETS = 256
 _MOST_BATCHES = 64
+_MOST_DRAINED = 4096  # after an error: more than the largest buffer holds
 _PAUSE_S = 0.005  # the kernel has the times
 
 
@@ -91,13 +92,17 @@ class SocketcanLink:
         if self._error is not None:
             raise self._error
         found: list[FrameArray] = []
-        for _ in range(_MOST_BATCHES):
+        most = _MOST_BATCHES
+        while most:
+            most -= 1
             looked_ns = self._tally.now_ns()
             try:
                 batch = self._receive.receive(self._socket.fileno())
             except OSError as error:
-                self._error = error  # first hand out what came before
-                break
+                if self._error is not None:
+                    break
+                self._error, most = error, _MOST_DRAINED  # first hand out what came before
+                continue
             if len(batch.sizes):
                 times = self._clock.times(batch.stamps_ns, self._floor_ns)
                 self._floor_ns = times[-1]

@@ -188,8 +188,9 @@ class SocketcandLink:
         times_ns: list[int] = []
         if self._first:
             pieces.append(self._first)
-            times_ns.append(now_ns)
+            times_ns.append(self._floor_ns)  # when the connection was open
             self._first = b""
+        pending = self._receiver.pending  # before: what isn't taken then comes later
         batches = self._receiver.take(_MOST_PIECES)
         ended = self._receiver.ended
         for batch in batches:
@@ -201,7 +202,8 @@ class SocketcandLink:
             times_ns += found
         if pieces:
             return (self._text.feed_pieces(pieces, times_ns, self._tally),)
-        self._floor_ns = max(self._floor_ns, now_ns - _LATEST_NS)
+        if not pending:  # after a stop of this process, pieces may wait for long
+            self._floor_ns = max(self._floor_ns, now_ns - _LATEST_NS)
         if ended:
             raise self._receiver.error or ConnectionResetError(
                 errno.ECONNRESET, "the server closed the connection"

@@ -109,6 +109,7 @@ class UnixSource:
         self._new: deque[_Sender] = deque()
         self._senders: list[_Sender] = []
         self._had_sender = False
+        self._lost_sender = False
         self._waits_since = 0.0
         self._ending = self._finished = False
 
@@ -121,6 +122,11 @@ class UnixSource:
     def connected(self) -> bool:
         """Whether a sender is connected."""
         return bool(self._senders)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection of a sender broke, and none has connected since."""
+        return self._lost_sender
 
     @property
     def finished(self) -> bool:
@@ -224,6 +230,7 @@ class UnixSource:
     def _add(self, sender: _Sender) -> None:
         back = self._had_sender and not self._senders
         self._had_sender = True
+        self._lost_sender = False
         self._tally.counts.reconnects += back
         self._tally.events.log_event("info", "a sender is back" if back else "a sender connected")
         self._senders.append(sender)
@@ -252,6 +259,7 @@ class UnixSource:
     def _drain(self, sender: _Sender, found: list[FrameArray]) -> None:
         """Take a sender's packets; remove it if it has disconnected."""
         looked_ns = self._tally.now_ns()
+        pending = sender.receiver.pending  # before: what isn't taken then comes later
         batches = sender.receiver.take(_MOST_PACKETS)
         ended = sender.receiver.ended
         for batch in batches:
@@ -261,7 +269,7 @@ class UnixSource:
             if len(frames):
                 found.append(frames)
                 sender.active, sender.last_ns = True, times[-1]
-        if not batches:
+        if not batches and not pending:  # after a stop of this process, packets may wait for long
             sender.floor_ns = max(sender.floor_ns, looked_ns - _LATEST_NS)
         if ended:
             self._remove(sender)
@@ -307,7 +315,13 @@ class UnixSource:
     def _remove(self, sender: _Sender) -> None:
         self._senders.remove(sender)
         sender.receiver.close()
-        self._tally.events.log_event("warn", "a sender disconnected")
+        error = sender.receiver.error
+        if error is None or isinstance(error, ConnectionError):  # it ended, or was killed
+            self._tally.events.log_event("warn", "a sender disconnected")
+            return
+        self._lost_sender = True
+        reason = error.strerror or str(error)
+        self._tally.events.log_event("error", f"lost the connection of a sender: {reason}")
 
 
 def open_unix(address: SourceAddress) -> Source:

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from . import contention, disks, gate, hostile, injection, kills, servers
+from . import contention, disks, gate, hostile, injection, interruptions, kills, servers
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
 from .stage import Stage
@@ -62,6 +62,7 @@ def mutated(seed, stage, part="mutated"):
 PARTS = {
     "contention": Part(contention.run, 6, 1, alone=True),
     "gate": Part(gate.run, 40, 3, alone=True),
+    "interruptions": Part(interruptions.run, 60, 4),
     "servers": Part(servers.run, 60, len(servers.ATTACKS)),
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 12),

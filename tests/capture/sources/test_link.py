@@ -11,8 +11,9 @@ from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import FRAME_DTYPE
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.contract import parse_address
+from undulog.capture.sources.drained_link import DrainedLink
 from undulog.capture.sources.link import LinkedSource
-from undulog.capture.sources.reader_thread import SO_RXQ_OVFL, SO_TIMESTAMPNS, DrainedLink
+from undulog.capture.sources.reader_thread import SO_RXQ_OVFL, SO_TIMESTAMPNS
 from undulog.capture.sources.socketcan import SocketcanLink
 
 FRAME = bytes.fromhex("23010000020000001122000000000000")

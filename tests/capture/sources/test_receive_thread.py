@@ -245,3 +245,49 @@ def test_a_quiet_sender_has_no_frames():
         wait_for(lambda: receiver.take(10), "the packet")
     wait_for(lambda: receiver.take(10) is not None and receiver.ended, "the end")
     receiver.close()
+
+
+STOPPED = """
+import socket, sys, time
+from undulog.capture.sources.reader_thread import ReceiveThread
+ours = socket.socket(fileno=int(sys.argv[1]))
+receiver = ReceiveThread(ours, 100)
+print("ready", flush=True)
+count = 0
+while not receiver.ended:
+    count += sum(size > 0 for batch in receiver.take(10_000) for size in batch.sizes)
+    time.sleep(0.001)
+print(count, receiver.error, flush=True)
+"""
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_SEQPACKET, socket.SOCK_STREAM])
+def test_a_stop_with_packets_in_hand_breaks_no_connection(kind):
+    """The kernel leaves its own code 512 in the socket; each packet is received."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, kind)
+    options = {"pass_fds": [ours.fileno()], "stdout": subprocess.PIPE, "text": True}
+    with (
+        theirs,
+        subprocess.Popen(
+            [sys.executable, "-c", STOPPED, str(ours.fileno())], **options
+        ) as receiver,
+    ):
+        ours.close()
+        assert receiver.stdout.readline() == "ready\n"
+        sent = 0
+        for _ in range(10):
+            for _ in range(5):  # received at once; the call goes on waiting for more
+                theirs.send(bytes(32))
+                sent += 1
+                time.sleep(0.002)
+            receiver.send_signal(signal.SIGSTOP)
+            os.waitid(os.P_PID, receiver.pid, os.WSTOPPED)
+            theirs.send(bytes(32))
+            sent += 1
+            receiver.send_signal(signal.SIGCONT)
+        theirs.shutdown(socket.SHUT_WR)
+        out, _ = receiver.communicate(timeout=60)
+    count, error = out.split()
+    assert error == "None"
+    if kind == socket.SOCK_SEQPACKET:
+        assert int(count) == sent
