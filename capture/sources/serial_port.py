@@ -16,6 +16,7 @@ import fcntl
 import os
 import select
 import stat
+import struct
 import termios
 import threading
 import tty
@@ -97,6 +98,48 @@ class PacketClock:
         return fd_records(packed)
 
 
+_TIOCGICOUNT = 0x545D
+_COUNTERS = struct.Struct("11i36x")
+"""``struct serial_icounter_struct`` (``linux/serial.h``): cts, dsr, rng, dcd, rx, tx, frame,
+overrun, parity, brk, buf_overrun, and nine reserved."""
+_OVERRUN, _BUFFER_OVERRUN = 7, 10
+
+
+class OverrunWatch:
+    """Counts what a port lost while it was not read: overruns of its chip and its driver's buffer.
+
+    Each overrun is counted as one lost frame. A pseudo-terminal has no such counter, and loses
+    nothing: its far end waits.
+    """
+
+    def __init__(self, fileno: int, tally: Tally) -> None:
+        """Start from the present counts of a terminal device."""
+        self._fileno, self._tally = fileno, tally
+        self.total = _overruns(fileno)
+        """Overruns since the port exists; None without a counter."""
+        if self.total is not None:
+            tally.counts.dropped = tally.counts.dropped or 0
+
+    def look(self) -> None:
+        """Count what was lost since the last call."""
+        if self.total is None:
+            return
+        now = _overruns(self._fileno)
+        if now is not None and now != self.total:
+            self._tally.lost("overrun of the serial port", max(0, now - self.total))
+            self.total = now
+
+
+def _overruns(fileno: int) -> int | None:
+    counters = bytearray(_COUNTERS.size)
+    try:
+        fcntl.ioctl(fileno, _TIOCGICOUNT, counters)
+    except OSError:  # no counters, or no device any more, which reading reports
+        return None
+    values = _COUNTERS.unpack(counters)
+    return values[_OVERRUN] + values[_BUFFER_OVERRUN]
+
+
 class SerialLink:
     """An open port."""
 
@@ -105,6 +148,7 @@ class SerialLink:
         self.detail = detail
         self._fileno: int | None = fileno
         self._clock, self._tally = clock, tally
+        self._overruns = OverrunWatch(fileno, tally)
         self._last_ns = 0
         self._error: OSError | None = None
 
@@ -124,6 +168,7 @@ class SerialLink:
             chunk = b""
         if chunk:
             now_ns = self._last_ns = self._tally.now_ns()
+            self._overruns.look()
         elif self._error is None:
             self._error = OSError(errno.EIO, "the device hung up")
         return (self._clock.feed(chunk, now_ns, self._tally),)

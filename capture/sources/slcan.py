@@ -41,7 +41,7 @@ from .contract import (
 from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
-from .serial_port import bauds, check_device, make_raw
+from .serial_port import OverrunWatch, bauds, check_device, make_raw
 
 STAMP_PERIOD_MS = 60_000
 """An adapter's time stamps start again after so many milliseconds."""
@@ -217,6 +217,7 @@ class SlcanLink:
         self._buffer = memoryview(bytearray(_CHUNK))
         self._text = SlcanText(stamps=settings.timestamps)
         self._tally = tally
+        self._overruns = OverrunWatch(fileno, tally)
         self._error: OSError | None = None
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:
@@ -243,6 +244,7 @@ class SlcanLink:
             self._error = error  # first hand out what came before
         if not chunks:
             return ()
+        self._overruns.look()
         return self._text.feed(b"".join(chunks), now_ns, self._tally)
 
     def fileno(self) -> int:

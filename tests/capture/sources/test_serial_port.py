@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import random
+import re
 import select
 import sys
 import time
@@ -19,6 +20,8 @@ from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import SERIAL_MORE, SERIAL_NOISE
 from undulog.capture.robot.serial_servos import dynamixel_packet, feetech_packet
 from undulog.capture.sources.contract import open_source, parse_address
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.serial_port import OverrunWatch
 
 
 @pytest.fixture
@@ -187,3 +190,42 @@ def test_a_tap_passes_bytes_both_ways_unchanged_and_knows_the_direction(tmp_path
     assert packets_in(records[records["dir"] == 0])[0] == answered
     reader.source.stop()
     assert not (tmp_path / "ttyTAP").is_symlink()
+
+
+def test_a_pseudo_terminal_has_no_counter_of_overruns_and_its_losses_stay_unknown():
+    master, slave = os.openpty()
+    try:
+        tally = Tally(lambda: 0)
+        watch = OverrunWatch(slave, tally)
+        watch.look()
+        assert tally.counts.dropped is None
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def listed_ports():
+    """Ports with a chip, and the overruns that the kernel lists of each (``oe``, ``bo``)."""
+    rows = []
+    with contextlib.suppress(OSError):
+        rows = Path("/proc/tty/driver/serial").read_text().splitlines()[1:]
+    ports = {}
+    for row in rows:
+        number, _, words = row.partition(":")
+        port = Path(f"/dev/ttyS{number}")
+        if "uart:unknown" not in words and os.access(port, os.R_OK):
+            counts = re.findall(r"\b(?:oe|bo):(\d+)", words)
+            ports[port] = sum(map(int, counts))
+    return ports
+
+
+def test_overruns_of_a_port_are_those_that_the_kernel_lists():
+    """None at all where the machine has no such port; a pseudo-terminal is tested above."""
+    for port, overruns in listed_ports().items():
+        fileno = os.open(port, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        try:
+            tally = Tally(lambda: 0)
+            assert OverrunWatch(fileno, tally).total == overruns
+            assert tally.counts.dropped == 0
+        finally:
+            os.close(fileno)
