@@ -10,7 +10,6 @@ from support.processes import run
 
 DOCS = ROOT / "docs"
 RUN_ELSEWHERE = {
-    "built_from.py",
     "conf.py",
     "notebook_page.py",
     "reference_pages.py",
