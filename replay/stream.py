@@ -115,7 +115,7 @@ class RrdFile(Closing):
             LogWriteError: If it can't be created.
         """
         self.path, self.taken = path, 0
-        """Bytes that were written, or dropped after a failed write; about, as a measure of progress."""
+        """Bytes that were written or dropped, as a measure of progress."""
         self._limit_s = limit_s
         self._error: OSError | None = None
         self._dropping = False
