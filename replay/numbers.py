@@ -28,6 +28,7 @@ from undulog.analysis.session.cycles import cycle_maps
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import DataError, UndulogError
+from undulog.capture.common.waits import LIMIT_S, Standstill, end_process, processor_time
 
 from .samples.content import Layer, Named
 
@@ -48,14 +49,16 @@ class Analysing(AbstractContextManager["Analysing"]):
         self._process: subprocess.Popen[bytes] | None = None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
+        self._still = Standstill(LIMIT_S)
 
     def __exit__(self, *_: object) -> None:
         """End it."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.kill()  # it has nothing to put in order
-            self._process.wait()
-        self._answer.close()
-        self._said.close()
+        try:
+            if self._process is not None:  # it has nothing to put in order
+                end_process(self._process, "the analysis of the session")
+        finally:
+            self._answer.close()
+            self._said.close()
 
     def start(self) -> None:
         """Start it, unless it has been."""
@@ -72,8 +75,14 @@ class Analysing(AbstractContextManager["Analysing"]):
     @property
     def layer(self) -> Layer | None:
         """Its result; None while it isn't done, and a note if it failed."""
-        if self._process is None or self._process.poll() is None:
+        if self._process is None:
             return None
+        if self._process.poll() is None:
+            if not self._still.reached(processor_time([self._process.pid])):
+                return None
+            end_process(self._process, "the analysis of the session")
+            why = f"the analysis computed nothing for {LIMIT_S:g} s and was ended"
+            return Layer(None, notes=(f"not analysed: {why}; start the command again",))
         code = self._process.returncode
         if code:
             self._said.seek(0)

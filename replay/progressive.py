@@ -13,19 +13,19 @@ start, so that nothing has to move, or to lose its camera and its place in time,
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from undulog.capture import SessionView
 from undulog.capture.common.console import Progress
-from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.errors import NoAnswerError, UndulogError
 from undulog.capture.common.process import StopRequest
+from undulog.capture.common.waits import Standstill, attended
 
 from .draw import mean_cycle
 from .draw.drawing import Drawing, Sources, clock_of
@@ -52,6 +52,7 @@ from .samples.content import (
 from .samples.quantities import GAIT, Survey, comes, survey
 from .samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
 from .samples.tracks import wanted_fields
+from .stream import BoundedStream, keep_for_ever
 from .viewer import Viewer
 
 
@@ -126,6 +127,12 @@ def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
     return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
 
 
+TAKES_S = 300.0
+"""Longest time for which the viewer may take nothing of what was sent [s]: a computer that draws
+without a graphics card takes tens of seconds for a large stretch."""
+
+_VIEWER = "the Rerun viewer"
+_ADVICE = "it is frozen or too busy; the session is unchanged, so start the command again"
 _TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
 _FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
@@ -164,44 +171,31 @@ class _Sink:
 
     viewer: Viewer
     stop: StopRequest
-    streams: list[rr.RecordingStream] = field(default_factory=list[rr.RecordingStream])
+    streams: list[BoundedStream] = field(default_factory=list[BoundedStream])
 
-    def open(self, identity: str) -> rr.RecordingStream:
+    def open(self, identity: str) -> BoundedStream:
         """Open a recording stream, which buffers until it is connected."""
         rec = open_recording(identity)
+        rec.look = self.look
         self.streams.append(rec)
         return rec
 
-    def connect(self, rec: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    def connect(self, rec: BoundedStream, layout: rrb.Blueprint) -> None:
         """Give the viewer its layout, and then the stream: else it makes a layout of its own."""
         self.viewer.wait_until_it_listens()
-        self._attended(lambda: rec.connect_grpc(self.viewer.address, default_blueprint=layout))
+        connect = partial(rec.connect_grpc, self.viewer.address, default_blueprint=layout)
+        try:
+            attended(connect, _VIEWER, _ADVICE, limit_s=TAKES_S, look=self.look)
+        except BaseException:
+            self._leave(rec)
+            raise
         # The default alone would give way to the last one; an active one is the user's own.
         rec.send_blueprint(layout)
 
-    def _attended(self, call: Callable[[], None]) -> None:
-        """Make a call of Rerun's that never returns if the viewer fails meanwhile."""
-        failed: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                call()
-            except BaseException as error:  # noqa: BLE001  raised again by the waiting thread
-                failed.append(error)
-
-        thread = threading.Thread(target=run, daemon=True)
-        thread.start()
-        while thread.is_alive():
-            thread.join(_TAKE_S)
-            try:
-                self.look()
-            except BaseException:
-                if thread.is_alive():  # closing the streams would block as well
-                    self.streams.clear()
-                    rr.unregister_shutdown()
-                raise
-        if failed:
-            raise failed[0]
+    def _leave(self, rec: BoundedStream) -> None:
+        """Leave a stream behind that stands still: to disconnect it would stand still as well."""
+        self.streams.remove(rec)
+        keep_for_ever(rec)
 
     def look(self) -> None:
         """Raise if the viewer has ended or an end is requested."""
@@ -211,8 +205,13 @@ class _Sink:
             self.viewer.check()
             raise NoLongerWantedError
 
-    def hand_over(self, rec: rr.RecordingStream) -> None:
-        """Wait until the viewer has received all data, unless an end is requested."""
+    def hand_over(self, rec: BoundedStream) -> None:
+        """Wait until the viewer has received all data, unless an end is requested.
+
+        Raises:
+            NoAnswerError: If the viewer takes nothing within the limit.
+        """
+        still = Standstill(TAKES_S)
         while True:
             self.look()
             begun = time.monotonic()
@@ -224,6 +223,8 @@ class _Sink:
                     self.look()
                     why = "the viewer runs but takes no more of the session"
                     raise UndulogError(f"{why}: {error}") from error
+                if still.reached():
+                    raise NoAnswerError(_VIEWER, TAKES_S, _ADVICE) from error
             else:
                 return
 

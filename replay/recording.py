@@ -32,10 +32,11 @@ from .draw.mean_cycle import Averaged
 from .layout import build_blueprint
 from .samples.content import Content, Layer, Named
 from .samples.timeline import stretches
+from .stream import BoundedStream, RrdFile
 
 APPLICATION = "undulog"
 
-Stream = TypeVar("Stream", bound=rr.RecordingStream)
+Stream = TypeVar("Stream", bound=BoundedStream)
 
 _RERUN = Path(rr.__file__).parent
 _NAMESPACE = uuid.UUID("8f4b6f0e-6f0a-5d3f-9a53-5d1f7a3f2c11")
@@ -115,7 +116,7 @@ def write_recording(
 @contextmanager
 def recording_file(
     path: Path, identity: str, name: str, start_ns: int, stop: StopRequest | None = None
-) -> Generator[rr.RecordingStream]:
+) -> Generator[BoundedStream]:
     """Open a recording stream into a file, which is whole on leaving.
 
     Args:
@@ -128,20 +129,26 @@ def recording_file(
     Raises:
         LogWriteError: If the file can't be written, or ``stop`` is requested.
     """
-    with part_file(path) as draft, _rerun_errors(path):
+    with part_file(path) as draft, _rerun_errors(path), RrdFile(draft, path) as file:
         rec = open_recording(identity, in_file=True)
+        file.connect(rec)
         try:
-            rec.save(draft)
             send_properties(rec, name, start_ns)
             yield rec
+        except BaseException as error:
+            file.close()
+            if isinstance(error, RuntimeError):  # what Rerun made of a failed write
+                file.check()
+            raise
         finally:
             rec.disconnect()
+        file.finish()
         require_whole(draft, path)
         check_stop(path, stop)
 
 
 def open_recording(
-    identity: str, kind: type[Stream] = rr.RecordingStream, *, in_file: bool = False
+    identity: str, kind: type[Stream] = BoundedStream, *, in_file: bool = False
 ) -> Stream:
     """Return a recording stream for a session, without a sink.
 
@@ -166,7 +173,7 @@ def send_properties(rec: rr.RecordingStream, name: str, start_ns: int) -> None:
 
 @contextmanager
 def _rerun_errors(path: Path) -> Generator[None]:
-    """Raise Rerun's ``RuntimeError``, e.g. on a full disk, as a LogWriteError with the path."""
+    """Raise a ``RuntimeError`` of Rerun's as a LogWriteError with the path."""
     try:
         yield
     except RuntimeError as error:
@@ -177,7 +184,7 @@ def _rerun_errors(path: Path) -> Generator[None]:
 
 
 def require_whole(draft: Path, path: Path) -> None:
-    """Check that a recording has its footer: Rerun only logs that its disk was full.
+    """Check that a recording has its footer: Rerun only logs what it failed to write.
 
     Args:
         path: What it will be called, for the message.

@@ -17,15 +17,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
-from undulog.capture.common.errors import MissingExtraError, UndulogError, UsageError
+from undulog.capture.common.errors import MissingExtraError, NoAnswerError, UndulogError, UsageError
 from undulog.capture.common.process import StopRequest, interruptible
+from undulog.capture.common.waits import Standstill, attended, end_process
 
 if TYPE_CHECKING:
     from rerun.experimental import View, ViewerClient
+
+_Answer = TypeVar("_Answer")
 
 LOOPBACK = "127.0.0.1"
 
@@ -37,6 +41,13 @@ Rerun's own limit, 1 GiB, a session of some hours would lose its beginning."""
 _PASSING_ON = "--server-memory-limit=64MB"
 
 _START_S = 60.0
+LOAD_S = 600.0
+"""Longest time for which the headless viewer may load a recording [s]: hours of 25 joints, 1 GB,
+take a minute on two cores."""
+
+_VIEWER = "the Rerun viewer"
+_ADVICE = "it is frozen or too busy; start the command again"
+_RESET_LAYOUT = "recording.reset_blueprint_to_default"
 _LOOK_S = 0.05
 _GRACE_S = 3.0
 _REST_S = 30.0
@@ -168,15 +179,11 @@ class Viewer(AbstractContextManager["Viewer"]):
     def close(self) -> None:
         """End it, frozen or not; safe to call twice."""
         self._closing = self._closing or not self.ended
-        if not self.ended:
-            self._process.terminate()
-            try:
-                self._process.wait(_GRACE_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-        self._process.wait()
-        self._scratch.cleanup()
-        self._errors.close()
+        try:
+            end_process(self._process, "the Rerun viewer", grace_s=_GRACE_S)
+        finally:
+            self._scratch.cleanup()
+            self._errors.close()
 
 
 def open_window(*options: str) -> Viewer:
@@ -288,14 +295,17 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         Args:
             seconds: Place on ``session_time`` [s].
         """
-        again = bool(self._client.get_state().recordings)
+        again = bool(self._asked(self._client.get_state).recordings)
         if again:
-            self._client.close("all")
-        self._client.open(str(recording.resolve()))
-        while self._client.get_state().loading:
+            self._asked(partial(self._client.close, "all"))
+        self._asked(partial(self._client.open, str(recording.resolve())))
+        still = Standstill(LOAD_S)
+        while self._asked(self._client.get_state).loading:
+            if still.reached():
+                raise NoAnswerError(_VIEWER, LOAD_S, f"it is loading {recording} still; {_ADVICE}")
             time.sleep(_LOOK_AGAIN_S)
         if again:  # it would keep the layout of the last one
-            self._client.run_command("recording.reset_blueprint_to_default")
+            self._asked(partial(self._client.run_command, _RESET_LAYOUT))
         self.seek(seconds)
 
     def seek(self, seconds: float) -> None:
@@ -306,7 +316,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         """
         from .samples.timeline import SESSION_TIME
 
-        self._client.set_time(SESSION_TIME, duration=seconds, play_state="paused")
+        at = {"duration": seconds}
+        self._asked(partial(self._client.set_time, SESSION_TIME, play_state="paused", **at))
 
     def seek_phase(self, degrees: int) -> None:
         """Stand still at a phase of the mean cycle.
@@ -316,17 +327,18 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         """
         from .samples.timeline import ENSEMBLE_CYCLE
 
-        self._client.set_time(ENSEMBLE_CYCLE, sequence=degrees, play_state="paused")
+        at = {"sequence": degrees}
+        self._asked(partial(self._client.set_time, ENSEMBLE_CYCLE, play_state="paused", **at))
 
     @property
     def views(self) -> dict[str, View]:
         """All views by name, those behind tabs included."""
-        return {view.name: view for view in self._client.get_state().views}
+        return {view.name: view for view in self._asked(self._client.get_state).views}
 
     def complaints(self) -> list[str]:
         """Return the errors that the views report."""
         self.picture()
-        views = self._client.get_state().views
+        views = self._asked(self._client.get_state).views
         return [f"{view.name}: {one.summary}" for view in views for one in view.reports]
 
     def picture(self, view: str | None = None) -> bytes:
@@ -352,14 +364,19 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
             UndulogError: If the picture doesn't come to rest.
         """
         deadline = time.monotonic() + _REST_S
-        last = self._client.take_screenshot(view_id)
+        shoot = partial(self._client.take_screenshot, view_id)
+        last = self._asked(shoot)
         while time.monotonic() < deadline:
-            shot = self._client.take_screenshot(view_id)
+            shot = self._asked(shoot)
             if shot == last:
                 return shot
             last = shot
             time.sleep(_LOOK_AGAIN_S)
         raise UndulogError("the viewer's picture doesn't come to rest")
+
+    def _asked(self, call: Callable[[], _Answer]) -> _Answer:
+        """Return the viewer's answer to a request, which Rerun waits for without a limit."""
+        return attended(call, _VIEWER, _ADVICE)
 
     def _let_greetings_pass(self) -> None:
         """Wait for the end of its notices, which lie over the first pictures and don't move."""
@@ -368,7 +385,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         while equal < _GREETINGS_GONE:
             if time.monotonic() > deadline:
                 raise UndulogError("the headless viewer's notices don't go away")
-            shot = self._client.take_screenshot(max_size=64)
+            shot = self._asked(partial(self._client.take_screenshot, max_size=64))
             last, equal = shot, equal + 1 if shot == last else 0
 
 
@@ -392,8 +409,11 @@ def client_of(
     deadline = time.monotonic() + _START_S
     while True:
         try:
-            client = ViewerClient.connect(address)
-            client.get_state()
+            connect = partial(ViewerClient.connect, address)
+            client = attended(connect, _VIEWER, _ADVICE, limit_s=_START_S)
+            attended(client.get_state, _VIEWER, _ADVICE, limit_s=_START_S)
+        except NoAnswerError:
+            raise
         except (ConnectionError, RuntimeError, TimeoutError) as error:
             if ended() or time.monotonic() > deadline:
                 raise _not_started() from error

@@ -1,14 +1,16 @@
-"""Signals and child processes of all tests; fixtures of display tests and of full disks."""
+"""Signals, child processes and limits of all tests; fixtures of display tests and of full disks."""
 
 import contextlib
 import ctypes
 import ctypes.util
+import faulthandler
 import gc
 import json
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -63,14 +65,73 @@ def _end_children(since_s=0.0):
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call():
+def pytest_runtest_call(item):
     """End the processes that a test started before it failed or was interrupted."""
     began_s = time.clock_gettime(time.CLOCK_BOOTTIME)
     try:
-        return (yield)
+        with _watched(item, "call"):
+            return (yield)
     except BaseException:
         _end_children(began_s)
         raise
+
+
+LIMIT = "UNDULOG_TEST_LIMIT_S"
+"""Environment variable: another limit for every test [s]; 0 for none, as for a debugger."""
+LIMIT_S = 120.0
+"""Longest time for the set-up, the call or the teardown of a test [s], after which the run ends
+with all stacks: 80 times what a test takes that isn't marked slow."""
+SLOW_LIMIT_S = 1200.0
+"""The same for a test that is marked slow."""
+WATCHER = Path(__file__).parent / "support" / "watcher.py"
+_watching = None
+
+
+def pytest_sessionstart(session):
+    """Start the process that ends a run whose test stands still."""
+    global _watching  # noqa: PLW0603
+    capture = session.config.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled() if capture else contextlib.nullcontext():
+        stderr = os.dup(2)  # that of the run, not of a test
+    faulthandler.register(signal.SIGUSR2, file=stderr, all_threads=True)
+    words = [sys.executable, "-S", "-E", str(WATCHER), str(stderr)]
+    _watching = subprocess.Popen(words, stdin=subprocess.PIPE, pass_fds=[stderr])
+
+
+def _watch(text=""):
+    """Begin a wait of the watcher, or end it."""
+    _watching.stdin.write(f"{text}\n".encode())
+    _watching.stdin.flush()
+
+
+@contextlib.contextmanager
+def _watched(item, phase):
+    usual_s = SLOW_LIMIT_S if item.get_closest_marker("slow") else LIMIT_S
+    limit_s = float(os.environ.get(LIMIT) or usual_s)
+    _watch(f"{limit_s} {item.nodeid} ({phase})")
+    try:
+        yield
+    finally:
+        _watch()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item):
+    """Limit the set-up of a test."""
+    with _watched(item, "set-up"):
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item):
+    """Limit the teardown of a test."""
+    with _watched(item, "teardown"):
+        return (yield)
+
+
+def pytest_enter_pdb():
+    """Give whoever debugs all the time there is."""
+    _watch()
 
 
 def pytest_collection_modifyitems(config, items):
@@ -110,6 +171,9 @@ def pytest_runtest_logfinish():
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish():
     """End all processes that still run."""
+    if _watching is not None:
+        _watching.stdin.close()
+        _watching.wait(60)
     _end_children()
 
 

@@ -14,10 +14,16 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,11 +34,13 @@ from undulog.capture.common.errors import (
     DataError,
     InputFileError,
     MissingExtraError,
+    NoAnswerError,
     UndulogError,
     UsageError,
 )
 from undulog.capture.common.process import StopRequest
 from undulog.capture.common.remote import ObjectStore
+from undulog.capture.common.waits import Standstill, processor_time
 from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts
 
@@ -62,6 +70,10 @@ _MOST_ROWS = 50_000
 
 _MOST_RESULT = 256 << 20
 _REMOTE_THREADS = 16
+STILL_S = 300.0
+"""How long the processes that analyse may compute nothing [s]; a network drive that comes back does
+so within minutes."""
+_LOOK_S = 0.5
 _VERSION = 2  # of what is read of a file; those that an earlier one read are read again
 _UNREAD = -1  # a size that no file has
 _ANALYSED = "analysis of "
@@ -337,13 +349,25 @@ class Catalog:
         self, names: Sequence[str], workers: int, stop: StopRequest
     ) -> Generator[tuple[str, str | dict[str, Any]]]:
         """Yield the result of each session, or why it has none."""
+        others = set(active_children())
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            running = {pool.submit(_analyse, self.where, name): name for name in names}
-            for future in as_completed(running):
-                yield running[future], future.result()
-                if stop.requested:
-                    pool.shutdown(cancel_futures=True)
-                    return
+            running: dict[Future[str | dict[str, Any]], str] = {
+                pool.submit(_analyse, self.where, name): name for name in names
+            }
+            still = Standstill(STILL_S)
+            while running:
+                done, _ = wait(running, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield running.pop(future), future.result()
+                if stop.requested:  # what has begun is waited for, with the same limit
+                    running = {one: name for one, name in running.items() if not one.cancel()}
+                processes = [one for one in active_children() if one not in others]
+                if not still.reached(processor_time(one.pid or 0 for one in processes)):
+                    continue
+                for one in processes:
+                    one.kill()
+                advice = "they were ended; run the command again, which goes on with the rest"
+                raise NoAnswerError("the analyses of the sessions", STILL_S, advice)
 
     def _files(self, kind: str) -> list[str]:
         """Names of the Parquet files of a kind, without those that another one replaces."""

@@ -42,6 +42,7 @@ from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.common.palette import joint_hex
+from undulog.capture.common.waits import end_process
 
 from ..catalog.fleet import Fleet
 from ..results import formats
@@ -400,7 +401,7 @@ def _run(command: list[str], messages: Path, longest_s: float) -> None:
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            end_process(process, command[0])
     if code:
         raise _failure(command[0], f"ended with exit code {code}", messages)
 

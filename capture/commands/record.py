@@ -169,6 +169,9 @@ def _lines(report: RecordReport) -> Iterator[str]:
 
 
 _Text = Annotated[str, Parameter(show_default=False)]
+_COMPLETE_S = 3600.0
+"""Longest wait for a recording to be complete [s]: the recorder itself has no limit on it, since
+its data must reach the disk, and goes on where this gives up."""
 _FAULTS = ("malformed", "error_frames", "reconnects")
 
 
@@ -258,7 +261,7 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
         json: Report as one JSON object.
     """
     # Finalising takes as long as it takes; without --wait the answer comes at once.
-    with _recorder(socket, for_ever=wait) as recorder:
+    with _recorder(socket, patience_s=_COMPLETE_S if wait else None) as recorder:
         reply = recorder.ask({"do": "stop", "wait": True} if wait else {"do": "stop"})
     if json or not wait:
         _print_reply("stopping", reply, as_json=json)
@@ -314,7 +317,7 @@ def _running() -> list[Path]:
     return paths
 
 
-def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
+def _recorder(socket: Path | None, *, patience_s: float | None = None) -> ControlClient:
     """Connect to the recorder of a socket, or to the only one that runs."""
     from ..recorder.control_client import PATIENCE_S, ControlClient
 
@@ -324,7 +327,7 @@ def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
             listed = "\n".join(f"  --socket {path}" for path in paths)
             raise UsageError(f"{len(paths)} recorders run; which one?\n{listed}")
         socket = paths[0]
-    return ControlClient(socket, patience_s=None if for_ever else PATIENCE_S)
+    return ControlClient(socket, patience_s=patience_s or PATIENCE_S)
 
 
 def _summary(recording: Mapping[str, Any]) -> list[str]:

@@ -18,6 +18,7 @@
     |- SourceError                          a source that can't be opened or used
     |- ControlError                         a running recorder that can't be reached, or refuses
     |  `- SocketInUseError                  another recorder listens at a control socket
+    |- NoAnswerError (TimeoutError)         a thread, a program or a disk that stands still
     `- LogError                             a log that cannot be read or written
        |- NotALogError                      not an MCAP file, or none of it readable
        |- MissingChannelError (KeyError)    the topic is not there; lists those that are
@@ -227,6 +228,15 @@ class ControlError(UndulogError):
 
 class SocketInUseError(ControlError):
     """Another recorder listens at a control socket."""
+
+
+class NoAnswerError(UndulogError, TimeoutError):
+    """What is waited for, outside this code, made no progress within its limit."""
+
+    def __init__(self, what: str, limit_s: float, advice: str) -> None:
+        """Build the message: what didn't answer, within how long, and what to do."""
+        self.what, self.limit_s = what, limit_s
+        super().__init__(f"{what} did not answer within {limit_s:g} s; {advice}")
 
 
 class ImportFormatError(LogError, ValueError):

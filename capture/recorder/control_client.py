@@ -182,11 +182,11 @@ PATIENCE_S = 10.0
 class ControlClient:
     """One connection to a running recorder."""
 
-    def __init__(self, path: Path, *, patience_s: float | None = PATIENCE_S) -> None:
+    def __init__(self, path: Path, *, patience_s: float = PATIENCE_S) -> None:
         """Connect.
 
         Args:
-            patience_s: Longest wait for a reply [s]; None for ever.
+            patience_s: Longest wait for a reply [s].
 
         Raises:
             ControlError: If no recorder listens there, or the socket is another user's.

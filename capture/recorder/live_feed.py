@@ -26,6 +26,7 @@ from typing import NamedTuple
 from mcap.records import Channel
 
 from ..common.errors import MissingExtraError, UndulogError
+from ..common.waits import end_process
 from ..log.mcap.batch import MessageBatch, MessageFields
 from ..log.write.mcap_sink import Description
 from .live_wire import (
@@ -84,13 +85,7 @@ class RelayProcess:
         self._complaints.unlink(missing_ok=True)
 
     def _end(self) -> None:
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(_GRACE_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        end_process(self._process, "the live view", grace_s=_GRACE_S)
         with suppress(ProcessLookupError):  # a viewer that a killed relay has left
             os.killpg(self._process.pid, signal.SIGKILL)
 

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import rerun as rr
 
-from undulog.capture.common.errors import DataError, LogWriteError, UsageError
+from undulog.capture.common.errors import DataError, NoAnswerError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.common.process import StopRequest, interruptible
+from undulog.capture.common.waits import LIMIT_S
 from undulog.capture.recorder.control_client import Identity, release
 from undulog.capture.recorder.live_wire import (
     HEAD_SIZE,
@@ -37,6 +37,7 @@ from undulog.capture.recorder.live_wire import (
 )
 
 from ..recording import open_recording, recording_id, require_whole, send_properties
+from ..stream import BoundedStream, RrdFile, keep_for_ever
 from ..viewer import Viewer
 from .decode import LiveLog
 from .scene import LiveScene
@@ -179,10 +180,7 @@ _FLUSH_S = 1.0
 _GRACE_S = 3.0
 _LOOK_S = 0.05
 
-# Streams whose viewer takes nothing: to let go of one would wait for it.
-_HELD: list[LiveStream] = []
-
-Connect = Callable[[rr.RecordingStream], None]
+Connect = Callable[[BoundedStream], None]
 """Gives a recording stream its sink."""
 
 
@@ -207,7 +205,7 @@ class RelayReport:
     complaint: str = ""
 
 
-class LiveStream(rr.RecordingStream):
+class LiveStream(BoundedStream):
     """A recording stream that logs static data only when they change."""
 
     def __init__(self, application_id: str, **options: Any) -> None:
@@ -254,7 +252,7 @@ class Relay:
         Args:
             inbox: Where the feed comes in.
             connect: Gives each session's recording stream its sink.
-            one_session: Whether to draw the first session only.
+            one_session: Whether to draw the first session only, into a file.
         """
         self._inbox, self._connect, self._one_session = inbox, connect, one_session
         self.ended = False
@@ -313,15 +311,15 @@ class Relay:
             self._end()
 
     def close(self) -> None:
-        """Flush the remaining data; waits for Rerun at most a second."""
+        """Flush the remaining data; a viewer gets a second to take them."""
         self._end()
         if self._rec is None:
             return
         try:
-            self._rec.flush(timeout_sec=_FLUSH_S)
-        except RuntimeError as error:
+            self._rec.flush(timeout_sec=None if self._one_session else _FLUSH_S)
+        except (RuntimeError, NoAnswerError) as error:
             self._complaint = f"the viewer did not take the last of it: {error}"
-            _HELD.append(self._rec)
+            keep_for_ever(self._rec)
             return
         self._rec.disconnect()
         self._rec = None
@@ -425,17 +423,17 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
         DataError: If no session came.
         LogWriteError: If the file can't be written.
     """
-    with interruptible() as request, part_file(output) as draft, Inbox(path) as inbox:
-
-        def save(rec: rr.RecordingStream) -> None:
-            try:
-                rec.save(draft)
-            except (RuntimeError, OSError) as error:
-                raise LogWriteError(output, f"can't be written: {error}") from error
-
-        report = _run(Relay(inbox, save, one_session=True), request, None, until_end=True)
+    with (
+        interruptible() as request,
+        part_file(output) as draft,
+        Inbox(path) as inbox,
+        RrdFile(draft, output) as file,
+    ):
+        relay = Relay(inbox, file.connect, one_session=True)
+        report = _run(relay, request, None, until_end=True, look=file.check)
         if not report.sessions:
             raise DataError(f"{path}: no recording was received; nothing is written")
+        file.finish()
         require_whole(draft, output)
         return report
 
@@ -462,17 +460,25 @@ class _Painter(threading.Thread):
 
 
 def _run(
-    relay: Relay, request: StopRequest, viewer: Viewer | None, *, until_end: bool = False
+    relay: Relay,
+    request: StopRequest,
+    viewer: Viewer | None,
+    *,
+    until_end: bool = False,
+    look: Callable[[], None] = lambda: None,
 ) -> RelayReport:
     """Draw until a stop is requested, or the viewer or (``until_end``) the session has ended."""
     painter = _Painter(relay)
     painter.start()
-    while painter.is_alive() and not request.requested:
-        if (viewer is not None and viewer.ended) or (until_end and relay.ended):
-            break
-        time.sleep(_LOOK_S)
-    painter.stop.set()
-    painter.join(_GRACE_S)
+    try:
+        while painter.is_alive() and not request.requested:
+            if (viewer is not None and viewer.ended) or (until_end and relay.ended):
+                break
+            look()
+            time.sleep(_LOOK_S)
+    finally:
+        painter.stop.set()
+    painter.join(LIMIT_S if until_end else _GRACE_S)
     if painter.is_alive() and viewer is not None:
         viewer.close()  # it takes nothing: what waits for it is let go
         painter.join(_GRACE_S)

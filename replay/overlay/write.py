@@ -38,6 +38,7 @@ from ..recording import Recording, recording_file, recording_id
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from ..samples.tracks import Track, decimate
+from ..stream import BoundedStream
 from . import draw
 from . import layout as words
 from .layout import SEPARATE, Found, Shown, build_blueprint
@@ -83,20 +84,23 @@ def chunks_of(
     return RrdReader(recording).stream().drop(content=_PROPERTIES).map(placed)
 
 
-def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
+def send(rec: BoundedStream, streams: Sequence[LazyChunkStream]) -> None:
     """Write chunks as they are read.
 
     Left to itself the reader runs ahead of the writer, and hours of chunks, unpacked, wait in
     between; so now and then it waits until all are written.
     """
     count = itertools.count(1)
+    read = 0
 
     def waiting(chunk: Chunk) -> Chunk:
-        if next(count) % _AHEAD == 0:
+        nonlocal read
+        read = next(count)
+        if read % _AHEAD == 0:
             rec.flush()
         return chunk
 
-    rec.send_chunks(LazyChunkStream.merge(*streams).map(waiting))
+    rec.send_stream(LazyChunkStream.merge(*streams).map(waiting), lambda: read)
 
 
 def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:

@@ -21,7 +21,9 @@ from queue import SimpleQueue
 from threading import Thread, Timer
 from typing import TYPE_CHECKING
 
-from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.console import complain
+from undulog.capture.common.errors import NoAnswerError, UndulogError
+from undulog.capture.common.waits import Standstill, end_process, processor_time
 
 if TYPE_CHECKING:
     from .rows import Row
@@ -29,6 +31,11 @@ if TYPE_CHECKING:
 
 _IDLE_S = 60.0
 """How long a process is kept for another run [s]."""
+STILL_S = 300.0
+"""How long a process may compute nothing while it makes a run [s]; a frozen one is ended."""
+_ENDED = "the process of a run has ended"
+_GRACE_S = 10.0  # to remove what it has written
+_LOOK_S = 0.5
 _OF_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -49,14 +56,16 @@ class RunProcesses:
             The answer, for :func:`row_in`.
 
         Raises:
-            ChildProcessError: If the process that made it has ended.
+            ChildProcessError: If the process that made it has ended, or stood still and was ended.
+            NoAnswerError: If it stands still and can't be ended.
         """
         process = self._taken()
         try:
             answer = process.ask(request)
         except (EOFError, OSError) as error:
             process.end()
-            raise ChildProcessError("the process of a run has ended") from error
+            still = isinstance(error, TimeoutError)
+            raise ChildProcessError(str(error) if still else _ENDED) from error
         timer = self._idle[process] = Timer(_IDLE_S, self._end_idle, [process])
         timer.daemon = True
         timer.start()
@@ -80,7 +89,10 @@ class RunProcesses:
     def _end_idle(self, process: _RunProcess) -> None:
         if timer := self._idle.pop(process, None):
             timer.cancel()
-            process.end()
+            try:
+                process.end()
+            except NoAnswerError as error:  # its run is done: this is no fault of the sweep
+                complain(str(error))
 
 
 class _RunProcess:
@@ -108,12 +120,20 @@ class _RunProcess:
 
     def ask(self, request: bytes) -> bytes:
         self._connection.send_bytes(request)
+        still = Standstill(STILL_S)
+        while not self._connection.poll(_LOOK_S):
+            if still.reached(processor_time([self._process.pid])):
+                raise TimeoutError(f"it computed nothing for {STILL_S:g} s and was ended")
         return self._connection.recv_bytes()
 
     def end(self) -> None:
-        self._connection.close()
-        self._process.wait()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._connection.close()  # its request to end
+        try:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_GRACE_S)
+            end_process(self._process, "a process of the sweep")
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def request_of(setting: Setting, job: Job) -> bytes:

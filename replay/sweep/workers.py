@@ -9,14 +9,15 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from typing import Any, Self
 
 from undulog.capture.common.console import complain
-from undulog.capture.common.errors import MissingExtraError, SourceError
+from undulog.capture.common.errors import MissingExtraError, NoAnswerError, SourceError
 from undulog.capture.common.process import StopRequest
+from undulog.capture.common.waits import Standstill, attended
 
 from .processes import RunProcesses, request_of, row_in, run_beside
 from .rows import Row
@@ -27,8 +28,10 @@ _AHEAD = 2
 _COUNT_S = 2.0
 """How often the workers of a cluster are counted [s]."""
 PATIENCE_S = 300.0
-"""How long a scheduler that ended is waited for [s]."""
+"""How long a scheduler that ended or doesn't answer, or a first worker, is waited for [s]."""
 
+_CANCEL_S = 10.0
+"""How long a scheduler may take to cancel runs, when an end is requested [s]."""
 _ATTEMPTS = 3
 """A run whose worker ends so often is a failed one."""
 
@@ -154,12 +157,14 @@ def run_on_cluster(
     Raises:
         MissingExtraError: If dask isn't installed.
         SourceError: If no scheduler answers there.
+        NoAnswerError: If the scheduler stops to answer, or no worker comes, within the limit.
         UndulogError: If a worker has other software, or can't keep a session.
     """
     queue = _Queue(jobs)
     client = _connected(address, stop, patience_s=0.0)
     running: dict[Any, Job] = {}
     threads, counted = 0, -_COUNT_S
+    without = Standstill(PATIENCE_S)
     try:
         while not stop.requested:
             if client.status != "running":
@@ -169,7 +174,10 @@ def run_on_cluster(
                 complain(f"{address}: the scheduler ended; waiting {PATIENCE_S:g} s for another")
                 client = _connected(address, stop, PATIENCE_S)
             if time.monotonic() - counted > _COUNT_S:
-                threads, counted = _threads(client), time.monotonic()
+                threads, counted = _threads(client, address, stop), time.monotonic()
+            if without.reached(time.monotonic() if threads else None):
+                advice = "start one by 'dask worker'; rows that are done are kept"
+                raise NoAnswerError(f"{address}: a worker of the cluster", PATIENCE_S, advice)
             while len(running) < _AHEAD * max(1, threads):
                 if (job := queue.next()) is None:
                     break
@@ -184,7 +192,7 @@ def run_on_cluster(
                 job = running.pop(future)
                 row = _outcome(future, job)
                 yield from queue.put_back([job]) if row is None else [row]
-        client.cancel(list(running))
+        _answer(lambda: client.cancel(list(running)), address, limit_s=_CANCEL_S)
     finally:
         _close(client)
 
@@ -215,13 +223,39 @@ def workers_of(address: str) -> int:
     """
     client = _connected(address, StopRequest(), patience_s=0.0)
     try:
-        return _threads(client)
+        return _threads(client, address, StopRequest())
     finally:
         _close(client)
 
 
-def _threads(client: Any) -> int:
-    workers = client.scheduler_info(n_workers=-1)["workers"]
+def _answer(
+    call: Callable[[], Any],
+    address: str,
+    look: Callable[[], None] = lambda: None,
+    limit_s: float = PATIENCE_S,
+) -> Any:
+    """Return what a scheduler answers; Dask waits for it without a limit."""
+    advice = "it is frozen or out of reach; rows that are done are kept, so start the sweep again"
+    what = f"{address}: the Dask scheduler"
+    return attended(call, what, advice, limit_s=limit_s, look=look)
+
+
+class _StoppedError(Exception):
+    """A stop was requested while the scheduler was waited for."""
+
+
+def _threads(client: Any, address: str, stop: StopRequest) -> int:
+    """Return how many threads all workers have; 0 where a stop is requested meanwhile."""
+
+    def look() -> None:
+        if stop.requested:
+            raise _StoppedError
+
+    try:
+        info = _answer(lambda: client.scheduler_info(n_workers=-1), address, look)
+    except _StoppedError:
+        return 0
+    workers = info["workers"]
     return sum(worker["nthreads"] for worker in workers.values())
 
 

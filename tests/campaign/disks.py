@@ -95,7 +95,7 @@ def _command(kind, folder, rng, stage):
     return result
 
 
-def _fill(place, spare):
+def fill(place, spare):
     """Fill a disk, but for a number of bytes."""
     state = os.statvfs(place)
     with contextlib.suppress(OSError), (place / "other").open("wb", buffering=0) as stream:
@@ -118,7 +118,7 @@ def _recorder(kind, folder, rng):
             sending[0].wait_for(20)
             time.sleep(rng.random() * 2)
             if kind.endswith("small"):  # somebody else fills it, but for a little
-                _fill(folder / "disk", rng.choice([0, 4096, 500_000]))
+                fill(folder / "disk", rng.choice([0, 4096, 500_000]))
             else:
                 subprocess.run(["umount", "-l", str(folder / "disk")], check=False)
                 time.sleep(2)

@@ -21,7 +21,17 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from . import contention, disks, gate, hostile, injection, interruptions, kills, servers
+from . import (
+    contention,
+    conversions,
+    disks,
+    gate,
+    hostile,
+    injection,
+    interruptions,
+    kills,
+    servers,
+)
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
 from .stage import Stage
@@ -67,6 +77,7 @@ PARTS = {
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 12),
     "disks": Part(disks.run, 400, 15),
+    "conversions": Part(conversions.run, 500, 10),
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),

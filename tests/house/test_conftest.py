@@ -1,13 +1,18 @@
-"""Processes of failed tests are ended, and children get signals that the caller ignores."""
+"""Processes of failed and hung tests are ended; children get signals that the caller ignores."""
 
+import contextlib
+import os
+import re
 import shlex
 import shutil
+import signal
 import sys
+from pathlib import Path
 
 import pytest
 
 from support.paths import ROOT
-from support.processes import run
+from support.processes import run, wait_for
 
 TESTS = """
 import signal, subprocess, sys
@@ -32,9 +37,80 @@ def test_afterwards():
 """
 
 
+HANGING = """
+import ctypes, os, subprocess, threading, time
+
+def wait_in_a_thread():
+    time.sleep(900)
+
+def start_processes():
+    # The second one is a grandchild in a session of its own.
+    shell = "sleep 901 & exec setsid sleep 902"
+    print(subprocess.Popen(["bash", "-c", shell]).pid, flush=True)
+    threading.Thread(target=wait_in_a_thread, daemon=True).start()
+
+def test_before():
+    pass
+
+def test_waits_for_ever():
+    start_processes()
+    time.sleep(900)
+
+def test_holds_the_interpreter():
+    start_processes()
+    ctypes.PyDLL(None).sleep(900)  # PyDLL doesn't release the lock of the interpreter
+
+def test_afterwards():
+    print("afterwards")
+"""
+
+
+def copy_conftest(folder):
+    """Copy what limits tests to a folder of its own."""
+    (folder / "support").mkdir()
+    for name in ("conftest.py", "support/watcher.py"):
+        shutil.copy(ROOT / "tests" / name, folder / name)
+
+
+def running(folder):
+    """Return the names of the processes that a run in a folder has left."""
+    found = []
+    for cwd in Path("/proc").glob("[0-9]*/cwd"):
+        with contextlib.suppress(OSError):
+            if cwd.readlink() == folder:
+                found.append((cwd.parent / "cmdline").read_bytes().replace(b"\0", b" "))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("test", ["waits_for_ever", "holds_the_interpreter"])
+def test_a_test_that_stands_still_ends_the_run_with_all_stacks(tmp_path, test):
+    copy_conftest(tmp_path)
+    (tmp_path / "test_three.py").write_text(HANGING)
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path]
+    words += ["-k", f"before or {test} or afterwards"]
+    done = run(*words, cwd=tmp_path, env=os.environ | {"UNDULOG_TEST_LIMIT_S": "4"})
+    assert done.returncode == -signal.SIGKILL, done.stdout
+    assert f"test_three.py::test_{test} (call) stood still for 4 s; all stacks:" in done.stderr
+    assert re.search(rf'File ".*test_three.py", line \d+ in test_{test}', done.stderr)
+    assert re.search(r'File ".*test_three.py", line \d+ in wait_in_a_thread', done.stderr)
+    assert done.stderr.endswith("the run is ended\n")
+    assert "afterwards" not in done.stdout
+    wait_for(lambda: running(tmp_path) == [], "all processes to end")
+
+
+@pytest.mark.slow
+def test_a_limit_of_zero_is_none(tmp_path):
+    copy_conftest(tmp_path)
+    (tmp_path / "test_one.py").write_text("import time\ndef test_long(): time.sleep(5)\n")
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path]
+    done = run(*words, cwd=tmp_path, env=os.environ | {"UNDULOG_TEST_LIMIT_S": "0"})
+    assert "1 passed" in done.stdout, done
+
+
 @pytest.mark.slow
 def test_a_failed_test_ends_its_processes_where_signals_are_ignored(tmp_path):
-    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
+    copy_conftest(tmp_path)
     (tmp_path / "test_two.py").write_text(TESTS)
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)]
     done = run("bash", "-c", f"trap '' INT HUP; exec {shlex.join(words)}", cwd=tmp_path)

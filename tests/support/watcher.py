@@ -1,0 +1,81 @@
+"""A process that ends a test run whose test stands still, with the stacks of all its threads.
+
+It is a process of its own, so that it also ends a run whose interpreter is held by compiled code.
+
+Usage: ``watcher.py STDERR``, the handle of the standard error of the run, its parent. Lines on
+standard input: ``SECONDS NAME`` begins a wait, an empty one ends it. Time counts by the watcher's
+own looks, so that a computer that slept is no reason.
+"""
+
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+LOOK_S = 1.0
+DUMP_S = 3.0
+"""For the run to print its stacks, on a busy computer [s]."""
+STACKS = signal.SIGUSR2
+"""The run prints its stacks on this signal."""
+
+
+def descendants(pid):
+    """Return all processes that a process has started, and those that they have."""
+    parents = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                facts = (folder / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if facts[0] != "Z":
+                parents[int(folder.name)] = int(facts[1])
+    found = {pid}
+    while more := {one for one, parent in parents.items() if parent in found} - found:
+        found |= more
+    return found - {pid, os.getpid()}
+
+
+def end(run, stderr, name, limit_s):
+    """Print what stood still and the stacks, then kill the run and all that it has started."""
+    os.write(stderr, f"\n{name} stood still for {limit_s:g} s; all stacks:\n".encode())
+    os.kill(run, STACKS)
+    time.sleep(DUMP_S)
+    os.kill(run, signal.SIGSTOP)  # orphans become its children, so none is missed
+    for _ in range(10):
+        for pid in descendants(run):
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        time.sleep(0.05)
+        if not descendants(run):
+            break
+    os.write(stderr, b"the run is ended\n")
+    os.kill(run, signal.SIGKILL)
+
+
+def main(stderr):
+    """Watch the parent until its pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is the run's own
+    run, name, left_s, limit_s, text = os.getppid(), "", 0.0, 0.0, b""
+    while True:
+        if select.select([0], [], [], LOOK_S)[0]:
+            data = os.read(0, 65536)
+            if not data:
+                return
+            *lines, text = (text + data).split(b"\n")
+            if lines:
+                seconds, _, name = lines[-1].decode().partition(" ")
+                left_s = limit_s = float(seconds or 0.0)
+        elif limit_s:
+            left_s -= LOOK_S
+            if left_s <= 0.0:
+                end(run, stderr, name, limit_s)
+                return
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
