@@ -33,6 +33,7 @@ from typing import Any
 
 from . import errors
 from .errors import LogError, UndulogError
+from .files import check_regular
 from .packets import Packet, receive, send
 
 _MIB = 1 << 20
@@ -100,6 +101,7 @@ def size_of(path: Path) -> int:
     Raises:
         OSError: If it isn't there or can't be read.
     """
+    check_regular(path)
     if path.is_dir():
         return sum(file.stat().st_size for file in path.iterdir() if file.is_file())
     return path.stat().st_size

@@ -20,7 +20,7 @@ from ..common.confined import Confined
 from ..common.confined_child import Send
 from ..common.errors import ImportFormatError, MissingExtraError, raised_as
 from ..common.extras import defer, is_installed
-from ..common.files import is_file
+from ..common.files import is_file, why_no_file
 from ..common.packets import Packet
 from ..log.messages.frames import FD_FRAME_DTYPE
 from .candump import read_candump
@@ -43,7 +43,7 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
         MissingExtraError: If the format is MF4 and its extra is not installed.
     """
     if not is_file(path):
-        raise ImportFormatError(path, "no such file")
+        raise ImportFormatError(path, why_no_file(path))
     suffix = log_suffix(path)
     if suffix not in SUFFIXES:
         raise ImportFormatError(path, f"is no CAN log by its suffix; valid: {', '.join(SUFFIXES)}")

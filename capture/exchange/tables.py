@@ -24,6 +24,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, raised_as
+from ..common.files import check_regular
 from ..common.strict_table import listed
 from .array_files import read_arrays
 from .column_blocks import WIDEST, Block, check_rows, refuse, rows_of_block, spread
@@ -111,11 +112,10 @@ def _rows(path: Path, delimiter: str) -> Generator[Iterator[list[str]]]:
 @contextmanager
 def _text(path: Path) -> Generator[TextIO]:
     caught = (OSError, UnicodeDecodeError, csv.Error)
-    with (
-        raised_as(ImportFormatError, path, "can't be read", *caught),
-        path.open(encoding="utf-8-sig", newline="") as stream,
-    ):
-        yield stream
+    with raised_as(ImportFormatError, path, "can't be read", *caught):
+        check_regular(path)
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            yield stream
 
 
 def _read_csv(

@@ -21,6 +21,7 @@ from mcap.opcode import Opcode
 
 from ...common.databases import DatabaseError, check_pages, open_database, table_names
 from ...common.errors import LogError, NotALogError
+from ...common.files import check_regular
 from ..mcap.chunk import BODY_AT, PREFIX_SIZE, walk_records
 from ..mcap.file import McapFile
 from .bag_metadata import Stated
@@ -97,6 +98,7 @@ def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Genera
     if reader is None:
         raise NotALogError(path, f"is no {' or '.join(_SUFFIXES)} file; run 'ros2 bag reindex'")
     try:
+        check_regular(path)
         if mode == "file":
             _decompress(path, scratch, allowance)
         with reader(scratch if mode == "file" else path) as part:
