@@ -16,6 +16,7 @@ from stat import S_ISDIR
 from typing import TypeAlias
 
 from undulog.capture.common.errors import InputFileError, UndulogError
+from undulog.capture.common.files import check_regular
 from undulog.capture.common.remote import ObjectStore, StoredFile
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
@@ -90,6 +91,7 @@ def source_facts(store: ObjectStore, source: Source) -> LogFacts:
         return read_bag_facts(plain)
     if plain.is_dir():
         plain = next(plain.glob("*.mcap"))
+    check_regular(plain)
     with open(plain, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered
         own = stream.fileno()
         size = os.fstat(own).st_size

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from ..common.console import emit
 from ..common.errors import ImportFormatError, UsageError
-from ..common.files import check_output, is_file
+from ..common.files import check_output, is_file, why_no_file
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def import_log(
     from ..robot.description import load_robot
 
     if not log.is_dir() and not is_file(log):
-        raise ImportFormatError(log, "no such file")
+        raise ImportFormatError(log, why_no_file(log))
     dataset = log.is_dir() and is_lerobot(log)
     if not dataset or output.suffix:
         why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"

@@ -14,6 +14,7 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
@@ -50,6 +51,13 @@ def undefer(name: str) -> None:
     if name in _hidden:
         _hidden.discard(name)
         del sys.modules[name]
+
+
+def is_installed(name: str) -> bool:
+    """Return whether a package could be imported; it isn't."""
+    if name in sys.modules and name not in _hidden:
+        return sys.modules[name] is not None  # pyright: ignore[reportUnnecessaryComparison]
+    return PathFinder.find_spec(name) is not None
 
 
 def attach(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], list[str]]:

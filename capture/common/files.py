@@ -9,8 +9,10 @@ are never changed.
 from __future__ import annotations
 
 import csv
+import errno
 import math
 import os
+import stat
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -44,13 +46,51 @@ def is_file(path: Path) -> bool:
         return False
 
 
+_KINDS = (
+    (stat.S_ISFIFO, "named pipe"),
+    (stat.S_ISSOCK, "socket"),
+    (stat.S_ISCHR, "device"),
+    (stat.S_ISBLK, "device"),
+)
+
+_OPEN_PIPES = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")
+"""Paths of descriptors that are open already, as a shell passes them: ``<(command)``."""
+
+
+def check_regular(path: Path | str) -> None:
+    """Refuse what is neither file nor folder, before it is opened.
+
+    A pipe without a writer is waited for without end, and a device may have no end.
+
+    Raises:
+        OSError: If it is none; its text says what it is. Also if it isn't there.
+    """
+    mode = os.stat(path).st_mode  # noqa: PTH116 - of a text, too
+    kind = next((name for is_kind, name in _KINDS if is_kind(mode)), None)
+    if kind is not None:
+        raise OSError(errno.EINVAL, f"it is a {kind}, not a file", str(path))
+
+
+def why_no_file(path: Path) -> str:
+    """Return what to report of a path at which no file can be read."""
+    try:
+        check_regular(path)
+    except FileNotFoundError:
+        return "no such file"
+    except (OSError, ValueError) as error:
+        return f"can't be read: {getattr(error, 'strerror', None) or error}"
+    return "no such file"
+
+
 def read_input(path: Path) -> bytes:
-    """Read a file that the user named.
+    """Read a file that the user named, or a pipe that a shell opened for it.
 
     Raises:
         InputFileError: If it isn't there or can't be read.
     """
     try:
+        if not (str(path).startswith(_OPEN_PIPES) and path.is_fifo()):
+            check_regular(path)
         return path.read_bytes()
     except FileNotFoundError as error:
         raise InputFileError(path, "no such file") from error

@@ -1,4 +1,4 @@
-"""Arrays of files of NumPy (``.npz``), MATLAB (``.mat``) and PyTorch (``.pt``).
+"""Arrays of files of NumPy (``.npz``), MATLAB (``.mat``) and PyTorch (``.pt``), in a child process.
 
 A ``.pt`` file is read without running what its pickle names. It is a zip: ``*/data.pkl`` names
 tensors by storage, shape and stride, ``*/data/KEY`` holds the raw numbers. The pickle's opcodes are
@@ -23,7 +23,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.confined import Confined
+from ..common.confined_child import Send
 from ..common.errors import ImportFormatError, raised_as
+from ..common.packets import Packet, is_plain
 from .column_blocks import MOST_BYTES, UNZIPPING, check_cells, read_entry, refuse
 
 _MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
@@ -65,6 +68,29 @@ class _Tensor:
     offset: int
     shape: tuple[int, ...]
     stride: tuple[int, ...]
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file by its suffix; one that is no array of numbers holds None.
+
+    They are not to be written.
+
+    Raises:
+        ImportFormatError: If it is damaged, of another version, or takes too much memory or time.
+    """
+    reader = Confined(ImportFormatError)
+    packet = reader.call(f"{__name__}:parse", path)
+    reader.close()
+    none = np.array(None)
+    return {name: packet.arrays.get(name, none) for name in packet.facts["names"]}
+
+
+def parse(path: Path, send: Send) -> None:
+    """Send the arrays of a file; runs in the child process."""
+    readers = {".npz": read_npz, ".mat": read_mat}
+    arrays = readers.get(path.suffix.lower(), read_tensors)(path)
+    plain = {name: array for name, array in arrays.items() if is_plain(array)}
+    send(Packet({"names": list(arrays)}, plain))
 
 
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
@@ -135,6 +161,8 @@ class _Machine:
             stack.append(_Global(str(argument)))
         elif name == "STACK_GLOBAL":
             member, module = stack.pop(), stack.pop()
+            if not isinstance(module, str) or not isinstance(member, str):
+                raise ImportFormatError(self._path, "its pickle names something else than tensors")
             stack.append(_Global(f"{module} {member}"))
         elif name == "TUPLE":
             stack.append(tuple(self._marked()))
@@ -148,6 +176,8 @@ class _Machine:
             cast("list[Any]", stack[-1]).extend(items)
         elif name in {"SETITEM", "SETITEMS"}:
             items = [stack.pop(-2), stack.pop()] if name == "SETITEM" else self._marked()
+            if not all(isinstance(key, str | int) for key in items[::2]):
+                raise ImportFormatError(self._path, "its pickle has a key that is no name")
             cast("dict[Any, Any]", stack[-1]).update(zip(items[::2], items[1::2], strict=True))
         elif name == "BINPERSID":
             stack.append(self._storage(stack.pop()))
@@ -171,10 +201,11 @@ class _Machine:
 
     def _storage(self, words: Any) -> _Storage:
         kind, storage, key = words[0], words[1], words[2]
-        if kind != "storage" or not isinstance(storage, _Global):
+        plain = kind == "storage" and isinstance(storage, _Global) and isinstance(key, str)
+        if not plain:
             raise ImportFormatError(self._path, "its pickle names something else than storages")
         dtype = _DTYPES.get(storage.name.removeprefix("torch "), "")
-        return _Storage(dtype, str(key))
+        return _Storage(dtype, key)
 
     def _rebuilt(self, function: Any, arguments: Any) -> object:
         name = function.name if isinstance(function, _Global) else ""

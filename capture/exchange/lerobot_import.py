@@ -14,7 +14,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -30,8 +30,9 @@ from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import FLOAT32, ImportReport, file_digest
-from .column_blocks import Block, read_parquet, refuse, rows_of_block, spread, vectors_of
+from .column_blocks import Block, refuse, rows_of_block, spread
 from .column_map import STATES, Column, ColumnMap
+from .parquet_blocks import ParquetReader, vectors_of
 from .table_import import TableSet, import_tables
 from .tables import TableFile
 
@@ -53,6 +54,7 @@ class LeRobotDataset:
         fps: Frames a second.
         names: Feature to the names of its elements.
         left_out: Features that are not imported.
+        reader: Reads its files.
     """
 
     folder: Path
@@ -61,6 +63,7 @@ class LeRobotDataset:
     fps: float
     names: Mapping[str, tuple[str, ...]]
     left_out: tuple[str, ...]
+    reader: ParquetReader = field(default_factory=ParquetReader, repr=False, compare=False)
 
     def files(self) -> list[Path]:
         """Return the files of frames, in order."""
@@ -72,8 +75,8 @@ class LeRobotDataset:
         for path in self.files():
             numbers = {
                 number
-                for batch in read_parquet(path, ["episode_index"], _ROWS)
-                for number in np.unique(_integers(path, batch, "episode_index")).tolist()
+                for block in self.reader.blocks(path, ["episode_index"], _ROWS)
+                for number in np.unique(_integers(path, block, "episode_index")).tolist()
             }
             for episode in numbers:
                 found.setdefault(episode, []).append(path)
@@ -135,10 +138,10 @@ def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(plain) if len(set(plain)) == count else tuple(numbered("joint", count))
 
 
-def _integers(path: Path, batch: Any, name: str) -> NDArray[Any]:
+def _integers(path: Path, block: Block, name: str) -> NDArray[Any]:
     """Return a column of frame or episode numbers."""
-    numbers = batch.column(name).to_numpy(zero_copy_only=False)
-    if numbers.dtype.kind not in "iu":
+    numbers = block[name]
+    if numbers.dtype.kind not in "iu" or numbers.ndim != 1:
         refuse(path, f"{name} holds no whole numbers")
     return numbers
 
@@ -243,37 +246,34 @@ def _episode(
     return TableSet(dataset.folder, {STATES: table}, digest, facts=facts, compression=FLOAT32)
 
 
-def _of_episode(path: Path, number: int, columns: Sequence[str], rows: int) -> Iterator[Any]:
-    """Return the frames of one episode in a file, as batches; only row groups that hold some."""
-    where = "episode_index", number
-    return (batch for batch in read_parquet(path, columns, rows, where) if len(batch))
-
-
 def _frames(path: Path, dataset: LeRobotDataset, number: int, rows: int) -> Iterator[Block]:
-    for batch in _of_episode(path, number, [*dataset.names, "frame_index"], rows):
-        frame = _integers(path, batch, "frame_index")
+    """Yield the frames of one episode in a file; only row groups that hold some are read."""
+    where = "episode_index", number
+    for vectors in dataset.reader.blocks(path, [*dataset.names, "frame_index"], rows, where=where):
+        frame = _integers(path, vectors, "frame_index")
         block: Block = {"time": np.rint(frame * (NS / dataset.fps)).astype(np.int64)}
         for name, names in dataset.names.items():
-            vectors = vectors_of(batch.column(name))
-            if vectors.shape != (len(frame), len(names)):
+            elements = vectors_of(vectors[name])
+            if elements.shape != (len(frame), len(names)):
                 refuse(path, f"{name} has not {len(names)} elements in each frame, as in info.json")
-            block |= spread(name, vectors)
+            block |= spread(name, elements)
         yield block
 
 
 def _task(dataset: LeRobotDataset, path: Path, number: int) -> str:
     """Return the text of an episode's task; empty if the dataset does not say."""
     try:
-        batch = next(_of_episode(path, number, ["task_index"], 1))
-        wanted = int(batch.column("task_index")[0].as_py())
+        where = "episode_index", number
+        (block,) = dataset.reader.blocks(path, ["task_index"], 1, where=where, most=1)
+        wanted = int(block["task_index"][0])
         lines = dataset.folder / "meta" / "tasks.jsonl"
         if lines.is_file():
             with lines.open(encoding="utf-8") as stream:
                 entries = (json.loads(line) for line in stream if line.strip())
                 return str(next(e["task"] for e in entries if e["task_index"] == wanted))
-        table = next(read_parquet(dataset.folder / "meta" / "tasks.parquet", None, _MOST_TASKS))
-        tasks = table.to_pydict()
+        listing = dataset.folder / "meta" / "tasks.parquet"
+        (tasks,) = dataset.reader.blocks(listing, None, _MOST_TASKS, most=1)
         texts = next(values for name, values in tasks.items() if name != "task_index")
-        return str(texts[tasks["task_index"].index(wanted)])
+        return str(texts[tasks["task_index"].tolist().index(wanted)])
     except Exception:  # noqa: BLE001 - a text for people only, in files of many makes
         return ""

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import NS, BoolArray, IntArray
-from ..common.errors import ImportFormatError, MissingExtraError
+from ..common.errors import ImportFormatError
 from ..common.extras import undefer
 from ..log.messages import frames as wire
 from ..log.messages.frames import empty_fd_frames
@@ -118,11 +118,12 @@ class _Piece:
 
 
 @contextmanager
-def open_mf4(path: Path) -> Generator[FrameLog]:
+def open_mf4(path: Path, scratch: Path) -> Generator[FrameLog]:
     """Open an MF4 file of CAN frames.
 
     Args:
         path: The file, also compressed, with ``.gz`` behind its suffix.
+        scratch: Folder for temporary files.
 
     Yields:
         The log: frames of all groups merged by their times, to the nanosecond; a bus is named
@@ -131,17 +132,16 @@ def open_mf4(path: Path) -> Generator[FrameLog]:
     Raises:
         ImportFormatError: If the file can't be read or holds no CAN frames; also while its blocks
             are taken.
-        MissingExtraError: If asammdf is not installed.
+        ImportError: If asammdf is not installed.
     """
-    try:
-        undefer("asammdf")
-        from asammdf import MDF
-    except ImportError as error:
-        raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf") from error
+    undefer("asammdf")
+    from asammdf import MDF
+
     # Its messages here are about decoding by databases inside the file, which is not needed.
     with _noted([]), _readable(path, "can't be read"):
         _check_head(path)
-        mdf = MDF(BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path)
+        source = BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path
+        mdf = MDF(source, temporary_folder=scratch)
     try:
         with _readable(path, "can't be read"):
             log = _log(path, mdf)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..common.arrays import NS, FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
-from ..common.files import write_text
+from ..common.files import check_regular, write_text
 from ..common.process import StopRequest
 from ..log.mcap.writer import Compression
 from ..log.read.facts import TIMES_FROM_FPS
@@ -163,6 +163,7 @@ def _open_folder(folder: Path) -> TableSet:
 
 def _names(path: Path) -> tuple[str, ...]:
     try:
+        check_regular(path)
         if path.stat().st_size > _MOST_NAMES:
             raise ImportFormatError(path, "is no list of joints: too long")
         text = path.read_text(encoding="utf-8-sig")
@@ -466,6 +467,7 @@ def _events(
 ) -> Iterator[_Messages]:
     """Yield the events of a table, a time and a text a row, in order of time."""
     try:
+        check_regular(path)
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:

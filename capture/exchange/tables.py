@@ -24,18 +24,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, raised_as
+from ..common.files import check_regular
 from ..common.strict_table import listed
-from .array_files import read_mat, read_npz, read_tensors
-from .column_blocks import (
-    WIDEST,
-    Block,
-    block_of,
-    check_rows,
-    read_parquet,
-    refuse,
-    rows_of_block,
-    spread,
-)
+from .array_files import read_arrays
+from .column_blocks import WIDEST, Block, check_rows, refuse, rows_of_block, spread
+from .parquet_blocks import ParquetReader, flat
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
@@ -88,9 +81,7 @@ def open_table(path: Path) -> TableFile:
         return _open_parquet(path)
     if suffix not in ARRAY_SUFFIXES:
         return _open_text(path)
-    readers = {".npz": read_npz, ".mat": read_mat}
-    arrays = readers.get(suffix, read_tensors)(path)
-    return _of_arrays(path, arrays, suffix.removeprefix("."))
+    return _of_arrays(path, read_arrays(path), suffix.removeprefix("."))
 
 
 def open_csv(path: Path, time: str, columns: Sequence[str], delimiter: str) -> TableFile:
@@ -121,11 +112,10 @@ def _rows(path: Path, delimiter: str) -> Generator[Iterator[list[str]]]:
 @contextmanager
 def _text(path: Path) -> Generator[TextIO]:
     caught = (OSError, UnicodeDecodeError, csv.Error)
-    with (
-        raised_as(ImportFormatError, path, "can't be read", *caught),
-        path.open(encoding="utf-8-sig", newline="") as stream,
-    ):
-        yield stream
+    with raised_as(ImportFormatError, path, "can't be read", *caught):
+        check_regular(path)
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            yield stream
 
 
 def _read_csv(
@@ -222,19 +212,19 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
 
 
 def _open_parquet(path: Path) -> TableFile:
-    first = next(read_parquet(path, None, _NARROW), None)
-    if first is None or not len(first):
+    reader = ParquetReader()
+    first = next(iter(list(reader.blocks(path, None, _NARROW, most=1))), None)
+    if first is None:
         refuse(path, "has no rows")
-    columns = tuple(block_of(first))
+    columns = tuple(flat(first))
     if len(columns) > WIDEST:
         refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
-    present = set(first.schema.names)
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
-        chosen = [n if n in present else re.sub(r"\[\d+\]$", "", n) for n in names]
-        batches = read_parquet(path, list(dict.fromkeys(chosen)), rows_of_block(len(columns)))
-        for batch in batches:
-            block = block_of(batch)
+        chosen = [n if n in first else re.sub(r"\[\d+\]$", "", n) for n in names]
+        rows = rows_of_block(len(columns))
+        for vectors in reader.blocks(path, list(dict.fromkeys(chosen)), rows):
+            block = flat(vectors)
             if absent := [name for name in names if name not in block]:
                 refuse(path, f"has rows without {absent[0]}")
             yield {name: block[name] for name in names}

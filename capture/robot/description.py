@@ -34,7 +34,7 @@ from typing import Any
 
 from ..common.config import read, read_field, read_fields, read_required
 from ..common.errors import Fault, RobotFileError
-from ..common.files import Shelf
+from ..common.files import Shelf, check_regular
 from ..common.strict_table import Faults, Table, listed, read_toml
 from .bus_map import read_bus
 from .kinematics import MESH_TYPES, mesh_type, read_meshes
@@ -271,6 +271,8 @@ def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Ro
 def _bytes(path: Any) -> bytes | None:  # a Path, or a Traversable inside the package
     """Return the content of a file; None if it cannot be read."""
     try:
+        if isinstance(path, Path):
+            check_regular(path)
         return path.read_bytes()
     except OSError:
         return None

@@ -46,8 +46,8 @@ class Outcome:
         signal: That signal, or None.
         killed: Whether the signal was ours, sent on purpose.
         hung: Whether the wall time ran out.
-        cpu_s: Processor time [s].
-        peak: Largest resident memory [byte].
+        cpu_s: Processor time of it and its children [s].
+        peak: Largest resident memory of the process, of its children, or of all at one time [byte].
         out: Bytes on standard output.
         err: Bytes on standard error.
     """
@@ -176,8 +176,9 @@ def run_forked(
         meanwhile(child)
     began = time.monotonic()
     killed = hung = False
-    wait_s = 0.0005
+    wait_s, together = 0.0005, 0
     while True:
+        together = max(together, resident(child))
         ended, status, used = os.wait4(child, os.WNOHANG)
         if ended:
             break
@@ -194,7 +195,26 @@ def run_forked(
     by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
     texts = [path.read_bytes() if path.exists() else b"" for path in streams]
     cpu_s = used.ru_utime + used.ru_stime
-    return Outcome(code, by, killed, hung, cpu_s, used.ru_maxrss * 1024, *texts)
+    peak = max(used.ru_maxrss * 1024, together)
+    return Outcome(code, by, killed, hung, cpu_s, peak, *texts)
+
+
+def resident(process):
+    """Return the resident memory of a process and its children [byte].
+
+    What processes share counts once where it is a file in memory, as the largest share.
+    """
+    numbers, private, shared = [process], 0, 0
+    for number in numbers:
+        try:
+            pages = Path(f"/proc/{number}/statm").read_text().split()
+            children = Path(f"/proc/{number}/task/{number}/children").read_text().split()
+        except OSError:  # it ended
+            continue
+        private += int(pages[1]) - int(pages[2])
+        shared = max(shared, int(pages[2]))
+        numbers += map(int, children)
+    return (private + shared) * resource.getpagesize()
 
 
 def run_command(words, folder, **options):

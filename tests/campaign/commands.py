@@ -43,6 +43,7 @@ COMMANDS = {
         (4, "import {file} -o new.mcap -r snake4.toml"),
         (1, "import {file} -o new.mcap -r snake4.toml --json"),
     ],
+    "binary trace": [(1, "import {file} -o new.mcap -r snake4.toml")],
     "table": [(1, "import {file} -o new.mcap -r snake4.toml --columns columns.toml")],
     "columns": [
         (3, "import {file} -o new.mcap"),
@@ -71,7 +72,7 @@ COMMANDS = {
             (1, "view {file} --save new.rrd"),
             (1, "api"),
         ]
-        for kind in ("bag", "bag file")
+        for kind in ("bag", "bag file", "database")
     },
     "serial": [
         *EDITS,
@@ -115,6 +116,7 @@ WEIGHTS = {
     "arrays": {"arrays": 1},
     "datasets": {"dataset": 1},
     "bags": {"bag": 2, "bag file": 1},
+    "binary": {"arrays": 5, "binary trace": 3, "database": 1},
     "serial": {"serial": 2, "feetech line": 1, "dynamixel2 line": 1},
 }  # fmt: skip
 """Part of the campaign to its kinds, and how often each of them comes."""

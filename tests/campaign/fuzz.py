@@ -18,6 +18,7 @@ from pathlib import Path
 
 from support.read_back import messages_of
 
+from . import binary
 from .bag_faults import BAGS, mutate_folder
 from .base import EPOCH_NS, files_below, write_files
 from .case import Result, front_door, judge, run_forked
@@ -109,6 +110,8 @@ def make_case(seed, bases, scratch, part="mutated"):
 
 def _mutated(data, suffix, rng, scratch, part):
     structure = BAGS if part == "bags" else STRUCTURE
+    if part == "binary":
+        structure = binary.structure(scratch, STRUCTURE | BAGS)
     if suffix in structure and rng.random() < 0.6:
         return structure[suffix](data, rng)
     if suffix in TEXTS:

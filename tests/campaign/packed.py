@@ -7,6 +7,8 @@ outside, with something inside that no program would write.
 import contextlib
 import io
 import struct
+import subprocess
+import sys
 import warnings
 import zipfile
 import zlib
@@ -207,7 +209,14 @@ def _pickles(data, rng):
     doubled = b"}q\x00" + b"".join(
         b"}q%c(Va\nh%cVb\nh%cu" % (k + 1, k, k) for k in range(rng.choice([8, 40]))
     )
+    nested = b"K\x01q\x00" + b"".join(
+        b"h%ch%c\x86q%c" % (k, k, k + 1) for k in range(rng.choice([8, 60]))
+    )
+    last = nested[-1:]
     texts = [
+        nested + b"}h" + last + b"K\x01s",
+        nested + b"(Vstorage\nctorch\nFloatStorage\nh" + last + b"Vcpu\nK\x01tQ",
+        nested + b"h" + last + b"\x93",
         doubled,
         b"}q\x00(Va\nh\x00u",
         b"}(Va\n" * 3000 + b"Nu" + b"u" * 2999,
@@ -311,6 +320,42 @@ def constant_parquet(rows, names):
     return out.getvalue()
 
 
+@cache
+def repeated_text(size, rows, *, plain):
+    """Return a table whose column of texts is one text, in a dictionary."""
+    out = io.BytesIO()
+    note = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, "i4")), pa.array(["x" * size]))
+    t = pa.array(np.arange(rows) / 100)
+    table = pa.table({"time": t, "joint1_pos": t, "note": note})
+    parquet.write_table(table, out, compression="zstd", store_schema=not plain)
+    return out.getvalue()
+
+
+@cache
+def long_lists(length):
+    """Return a table of three rows, of which the first has a list of zeros.
+
+    It is written by another process, since cases are forked from this one with all its memory.
+    """
+    code = (
+        "import sys, numpy as np, pyarrow as pa; from pyarrow import parquet; "
+        "n = int(sys.argv[1]); "
+        "lists = pa.ListArray.from_arrays(pa.array([0, n, n, n], pa.int32()), "
+        "pa.array(np.zeros(n, 'f4'))); parquet.write_table(pa.table({'time': [0.0, 0.1, 0.2], "
+        "'joint1_pos': lists}), sys.stdout.buffer, compression='zstd')"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code, str(length)], check=True, capture_output=True
+    ).stdout
+
+
+def _repeated(data, rng):
+    if rng.random() < 0.5:
+        return long_lists(rng.choice([10**6, 10**8]))
+    size, rows = rng.choice([(1 << 20, 20_000), (1 << 12, 20_000), (1 << 20, 60)])
+    return repeated_text(size, rows, plain=rng.random() < 0.5)
+
+
 def _constant(data, rng):
     return constant_parquet(rng.choice([1, 6]) * 1_000_000, ("time", "joint1_pos", "joint1_vel"))
 
@@ -364,7 +409,7 @@ PACKED = {
     ".parquet": one_of(
         *map(_remake_parquet, (_changed_column, _changed_column, _changed_names, _changed_rows)),
         *map(_remake_parquet, (_changed_column, _changed_column, _changed_names, _changed_rows)),
-        _constant,
+        _constant, _repeated,
     ),
     ".mat": one_of(_odd_mat, _repacked),
 }  # fmt: skip

@@ -84,8 +84,9 @@ PARTS = {
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
+    "binary": Part(partial(mutated, part="binary"), 4_500, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 35_214, 120),
+    "mutated": Part(mutated, 30_714, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from .bags import bag_bases
 from .base import make_bases
+from .binary import binary_bases
 from .case import run_command
 from .commands import COMMANDS
 from .foreign import foreign_bases
@@ -16,7 +17,7 @@ from .fuzz import Case, warm
 
 WHOLE = {
     "log", "trace", "scenario", "robot", "columns", "apart", "arrays", "dataset", "serial",
-    "feetech line", "dynamixel2 line", "bag", "bag file",
+    "feetech line", "dynamixel2 line", "bag", "bag file", "binary trace", "database",
 }  # fmt: skip
 """Kinds whose command lines end with exit code 0 on whole files."""
 
@@ -36,7 +37,10 @@ class Stage:
         (folder / "bases").mkdir()
         self.bases = make_bases(folder / "bases", self._result_of)
         self.bases += foreign_bases(folder / "bases" / "foreign")
-        self.bases += bag_bases(folder / "bases" / "bags")
+        bags = bag_bases(folder / "bases" / "bags")
+        database = next(one for one in bags if one.name == "bare.db3")
+        self.bases += bags
+        self.bases += binary_bases(folder / "bases" / "binary", database.files["bare.db3"])
         self.warm_failures = self._warm()
 
     def _result_of(self, gait):

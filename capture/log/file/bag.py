@@ -12,12 +12,18 @@ from __future__ import annotations
 
 import errno
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from ...common.confined import Confined, size_of
+from ...common.confined_child import Send
 from ...common.errors import LogError, MissingExtraError, NotALogError, UndulogError
+from ...common.extras import is_installed
+from ...common.packets import Packet
 from ..messages.definitions import CONTROLLER_STATE, DYNAMIC_STATE
 from .bag_metadata import METADATA, Stated, is_rosbag2, metadata_text, read_stated
 from .bag_parts import Allowance, opened
@@ -192,55 +198,79 @@ class BagCopy:
             NotALogError: If the bag is damaged, of an unknown kind, or expands too far.
             LogError: If the disk has no room for the copy.
         """
-        try:
-            from .bag_ros1 import BoundedReader
-        except ImportError as error:
-            raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
-        from tempfile import TemporaryDirectory, gettempdir
-
-        ros1 = path.suffix == _ROS1
-        scratch = folder or Path(gettempdir())
+        if not is_installed("rosbags"):
+            raise MissingExtraError("reading a recording of ROS", "bags", "rosbags")
+        scratch = folder or Path(tempfile.gettempdir())
         size = check_room(path, scratch)
-        self._folder = TemporaryDirectory(prefix="undulog-bag-", dir=folder)
+        self._folder = tempfile.TemporaryDirectory(prefix="undulog-bag-", dir=folder)
         self.path = Path(self._folder.name, _COPY)
+        reader = Confined(NotALogError)
         try:
-            with self.path.open("wb") as stream:
-                copy = _Copy(path, stream, Allowance(path, size), on_part)
-                if ros1:
-                    with BoundedReader(path, Allowance(path, size)) as bag:
-                        types = Ros1Types(bag.connections)
-                        read = (
-                            (way, t_ns, types.cdr(way, raw)) for way, t_ns, raw in bag.messages()
-                        )
-                        copy.add(bag.connections, bag.message_count, read, types.definition)
-                else:
-                    copy.rosbag2(Path(self._folder.name, "part"), Allowance(path, size))
-                copy.finish()
-            self.content = content_id_of(copy.files)
-        except BaseException as error:
+            with closing(
+                reader.stream(
+                    f"{__name__}:parse", path, size=size, folder=self._folder.name,
+                    scratch=str(scratch),
+                )
+            ) as packets:  # fmt: skip
+                for packet in packets:
+                    if "share" in packet.facts:
+                        on_part(packet.facts["share"])
+                    else:
+                        self.content: str = packet.facts["content"]
+                        self.warnings: list[str] = packet.facts["warnings"]
+        except BaseException:
             self.close()
-            known = isinstance(error, MemoryError | UndulogError)
-            if known or not isinstance(error, Exception):
-                raise
-            # rosbags lets errors of struct, bz2 and dictionaries through
-            if isinstance(error, OSError) and error.errno in _FULL:
-                why = f"its copy fills {scratch}; choose a larger disk (TMPDIR)"
-                raise LogError(path, why) from error
-            why = " ".join(str(error).split()) or type(error).__name__
-            kind, fix = _WHAT[ros1]
-            raise NotALogError(path, f"can't be read as {kind}: {why}; {fix}") from error
-        of = " of ROS 1" if ros1 else ""
-        self.warnings = [
-            *copy.warnings,
-            *(
-                f"{topic}: {count} messages{of} are damaged and left out"
-                for topic, count in copy.damaged.items()
-            ),
-        ]
+            raise
+        finally:
+            reader.close()
 
     def close(self) -> None:
         """Remove the copy."""
         self._folder.cleanup()
+
+
+def parse(path: Path, send: Send, *, folder: str, scratch: str) -> None:
+    """Copy a bag into a folder; runs in the child process.
+
+    Args:
+        scratch: The folder that the user knows.
+    """
+    from .bag_ros1 import BoundedReader
+
+    tempfile.tempdir = folder
+    ros1, size = path.suffix == _ROS1, size_of(path)
+
+    def on_part(share: float) -> None:
+        send(Packet({"share": share}))
+
+    try:
+        with Path(folder, _COPY).open("wb") as stream:
+            copy = _Copy(path, stream, Allowance(path, size), on_part)
+            if ros1:
+                with BoundedReader(path, Allowance(path, size)) as bag:
+                    types = Ros1Types(bag.connections)
+                    read = ((way, t_ns, types.cdr(way, raw)) for way, t_ns, raw in bag.messages())
+                    copy.add(bag.connections, bag.message_count, read, types.definition)
+            else:
+                copy.rosbag2(Path(folder, "part"), Allowance(path, size))
+            copy.finish()
+        content = content_id_of(copy.files)
+    except (MemoryError, UndulogError):
+        raise
+    except Exception as error:
+        # rosbags lets errors of struct, bz2 and dictionaries through
+        if isinstance(error, OSError) and error.errno in _FULL:
+            why = f"its copy fills {scratch}; choose a larger disk (TMPDIR)"
+            raise LogError(path, why) from error
+        why = " ".join(str(error).split()) or type(error).__name__
+        kind, fix = _WHAT[ros1]
+        raise NotALogError(path, f"can't be read as {kind}: {why}; {fix}") from error
+    of = " of ROS 1" if ros1 else ""
+    damaged = [
+        f"{topic}: {count} messages{of} are damaged and left out"
+        for topic, count in copy.damaged.items()
+    ]
+    send(Packet({"content": content, "warnings": [*copy.warnings, *damaged]}))
 
 
 def check_room(path: Path, folder: Path) -> int:
@@ -254,8 +284,7 @@ def check_room(path: Path, folder: Path) -> int:
     """
     from shutil import disk_usage
 
-    files = [path] if path.is_file() else [each for each in path.iterdir() if each.is_file()]
-    size = sum(each.stat().st_size for each in files)
+    size = size_of(path)
     free = disk_usage(folder).free
     if free < size:
         why = f"its copy needs {size} bytes, {folder} has {free}; choose a larger disk (TMPDIR)"

@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import zstandard
 from mcap.opcode import Opcode
 
+from ...common.databases import DatabaseError, check_pages, open_database, table_names
 from ...common.errors import LogError, NotALogError
+from ...common.files import check_regular
 from ..mcap.chunk import BODY_AT, PREFIX_SIZE, walk_records
 from ..mcap.file import McapFile
 from .bag_metadata import Stated
@@ -96,6 +98,7 @@ def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Genera
     if reader is None:
         raise NotALogError(path, f"is no {' or '.join(_SUFFIXES)} file; run 'ros2 bag reindex'")
     try:
+        check_regular(path)
         if mode == "file":
             _decompress(path, scratch, allowance)
         with reader(scratch if mode == "file" else path) as part:
@@ -189,30 +192,19 @@ def _end(data: Any, at: int) -> int:
 
 @contextmanager
 def _sqlite(path: Path) -> Generator[Part]:
-    with _connected(path) as (base, tables):
-        yield _database(path, base, tables)
+    with _connected(path) as base:
+        yield _database(base)
 
 
 @contextmanager
-def _connected(path: Path) -> Generator[tuple[sqlite3.Connection, set[str]]]:
-    """Open a database; give its tables, of which topics and messages are two."""
+def _connected(path: Path) -> Generator[sqlite3.Connection]:
+    """Open a database of topics and messages."""
     import sqlite3
 
     try:
-        name = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(name, uri=True)) as base:
-            base.text_factory = _readable
-            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
-            # A view or a table of a module is a program, which may never end.
-            tables = base.execute(
-                "SELECT name FROM sqlite_master "
-                "WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
-            )
-            known = {str(name) for (name,) in tables}
-            if not {"topics", "messages"} <= known:
-                raise NotALogError(path, f"has no tables of topics and messages; {_REINDEX}")
-            yield base, known
-    except sqlite3.Error as error:
+        with open_database(path, ("topics", "messages")) as base:
+            yield base
+    except (sqlite3.Error, DatabaseError) as error:
         why = " ".join(str(error).split())
         raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}") from error
 
@@ -225,10 +217,7 @@ def read_database_facts(path: Path) -> Stated:
     Raises:
         NotALogError: If it is damaged.
     """
-    with _connected(path) as (base, _):
-        columns = base.execute("SELECT hidden FROM pragma_table_xinfo('messages')")
-        if any(hidden for (hidden,) in columns):  # the time of each may take as long as it likes
-            raise NotALogError(path, f"has a table of messages that are computed; {_REINDEX}")
+    with _connected(path) as base:
         most = path.stat().st_size // _ROW_SIZE  # pages that lead to themselves have no end
         topics = base.execute("SELECT name FROM topics LIMIT ?", (_MOST_TOPICS,)).fetchall()
         count, first, last = base.execute(
@@ -243,20 +232,13 @@ def read_database_facts(path: Path) -> Stated:
     return Stated([path], "", first, last - first, count, names)
 
 
-def _readable(data: bytes) -> str:
-    return data.decode("utf-8", "replace")
-
-
 _REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
 
 
-def _database(path: Path, base: sqlite3.Connection, known: set[str]) -> Part:
-    # Pages that are part of two trees, or of themselves, would be read without end.
-    if (found := str(base.execute("PRAGMA quick_check(1)").fetchone()[0])) != "ok":
-        why = " ".join(found.split())[:200]
-        raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}")
+def _database(base: sqlite3.Connection) -> Part:
+    check_pages(base)
     definitions: dict[str, tuple[str, str]] = {}
-    if "message_definitions" in known:
+    if "message_definitions" in table_names(base):
         rows = base.execute(
             "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         )
@@ -269,8 +251,11 @@ def _database(path: Path, base: sqlite3.Connection, known: set[str]) -> Part:
     (count,) = base.execute("SELECT count(*) FROM messages").fetchone()
 
     def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
-        rows = base.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp")
-        for key, t_ns, data in rows:
+        # Messages are not sorted themselves: without an index they would go to temporary files.
+        chosen = base.cursor()
+        for row in base.execute("SELECT rowid FROM messages ORDER BY timestamp"):
+            chosen.execute("SELECT topic_id, timestamp, data FROM messages WHERE rowid = ?", row)
+            key, t_ns, data = chosen.fetchone()
             if key not in ways:
                 continue
             whole = isinstance(data, bytes) and isinstance(t_ns, int) and t_ns >= 0

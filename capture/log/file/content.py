@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
+from ...common.files import check_regular
+
 _PIECE = 4 << 10  # few bytes, because a server has to be asked for them
 _PIECES = 4
 
@@ -47,6 +49,7 @@ def content_id_of(paths: Sequence[Path]) -> str:
     with ExitStack() as stack:
         files: list[tuple[int, Read]] = []
         for path in paths:
+            check_regular(path)
             own = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             stack.callback(os.close, own)
             files.append((os.fstat(own).st_size, partial(_read, own)))

@@ -18,6 +18,7 @@ import zstandard
 
 from ...common.arrays import merged_ranges
 from ...common.errors import InputFileError, LogError, NotALogError
+from ...common.files import check_regular
 from ...common.remote import HEAD_SIZE, RemoteFile, RemotePath
 from .chunk import (
     PREFIX_SIZE,
@@ -396,6 +397,7 @@ class McapPayloads:
 def _mapped(path: Path) -> tuple[mmap.mmap, int]:
     """Map a file; return also a descriptor of it."""
     try:
+        check_regular(path)
         with path.open("rb") as stream:
             if not stream.read(1):
                 raise NotALogError(path, "the file is empty (0 bytes)")

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -25,7 +26,11 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 
+from ...common.confined import Confined
+from ...common.confined_child import Send
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
+from ...common.extras import is_installed
+from ...common.packets import Packet
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
 from ..file.content import content_id, content_id_of
@@ -207,10 +212,7 @@ def read_bag_facts(path: Path) -> LogFacts:
         MissingExtraError: If ``rosbags`` or the YAML parser is not installed and needed.
     """
     try:
-        if path.is_dir():
-            stated = read_stated(path)
-        else:
-            stated = _of_ros1(path) if path.suffix == ".bag" else read_database_facts(path)
+        stated = read_stated(path) if path.is_dir() else _of_file(path)
     except ImportError as error:
         raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
     facts = LogFacts(
@@ -249,6 +251,22 @@ def read_wal_facts(path: Path) -> LogFacts:
             topics.add(item.topic)
     damage = f"only its write-ahead log is there: undulog log recover {path.name}"
     return LogFacts(topics=tuple(sorted(topics)), metadata=metadata, damage=damage)
+
+
+def _of_file(path: Path) -> Stated:
+    """Read what a .db3 or .bag file states, in a child process."""
+    if path.suffix == ".bag" and not is_installed("rosbags"):
+        raise ImportError("rosbags")
+    with closing(Confined(NotALogError)) as reader:
+        facts = reader.call(f"{__name__}:parse", path).facts
+    return Stated([path], "", *facts["times"], facts["messages"], tuple(facts["topics"]))
+
+
+def parse(path: Path, send: Send) -> None:
+    """Send what a .db3 or .bag file states; runs in the child process."""
+    stated = _of_ros1(path) if path.suffix == ".bag" else read_database_facts(path)
+    times = stated.start_ns, stated.duration_ns
+    send(Packet({"times": times, "messages": stated.messages, "topics": stated.topics}))
 
 
 def _of_ros1(path: Path) -> Stated:

@@ -22,6 +22,7 @@ from mcap.records import Channel
 
 from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
+from ...common.files import check_regular
 from ..mcap.chunk import FIXED_SIZE, MESSAGE, Block
 from .format import (
     DEFINITIONS,
@@ -137,6 +138,7 @@ class Recovery(Iterator[WalMessage]):
 
     def _read_header(self, stream: int, number: int, path: Path) -> _Found | None:
         try:
+            check_regular(path)
             with path.open("rb") as file:
                 size = file.seek(0, os.SEEK_END)
                 for at in (0, max(0, size - HEADER_SIZE)):
