@@ -8,7 +8,6 @@ damaged, a scan reads all sources again and sets it aside.
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -27,6 +26,7 @@ from undulog.capture.common.errors import (
 )
 from undulog.capture.common.object_store import ObjectStore
 from undulog.capture.common.process import StopRequest
+from undulog.capture.common.untrusted_text import read_json
 from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts
 
@@ -298,7 +298,7 @@ class Catalog:
         except MissingExtraError as error:  # read again, when the extra may be there
             rows = [self._session(file, LogFacts(damage=str(error)))]
             return replace(file, size=_UNREAD), {"sessions": rows}, str(error)
-        except (UndulogError, *_FAULTS, OSError, RecursionError) as error:
+        except (UndulogError, *_FAULTS, OSError) as error:
             facts = [LogFacts(damage=str(error))] if file.is_log else []
             return file, {"sessions": [self._session(file, one) for one in facts]}, str(error)
 
@@ -326,7 +326,7 @@ class Catalog:
     def _result(self, file: Source) -> dict[str, list[Row]]:
         if file.size > _MOST_RESULT:
             return {}
-        value = json.loads(self._store.read(file.name))
+        value = read_json(self._store.read(file.name))
         if not is_result(value):
             return {}
         analysis, joints = _checked(file.name, value)

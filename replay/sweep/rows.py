@@ -36,6 +36,7 @@ from undulog.capture.common.errors import (
     UsageError,
 )
 from undulog.capture.common.object_store import ObjectStore
+from undulog.capture.common.untrusted_text import read_json
 
 _ARROW: Any = pa  # comes without types
 _FS: Any = pafs
@@ -274,8 +275,8 @@ class RowStore:
         with _with_cure(path):
             data = self._store.read(name)
         try:
-            row: object = json.loads(data)
-        except (ValueError, RecursionError) as error:
+            row: object = read_json(data)
+        except ValueError as error:
             raise DamagedFileError(path, f"is no JSON: {error}{_CURE}") from error
         key = PurePosixPath(name).stem[:_KEY_DIGITS]
         if not isinstance(row, dict) or cast("Row", row).get("key") != key:

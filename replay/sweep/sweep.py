@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from undulog.capture.common.process import StopRequest
-from undulog.capture.common.strict_table import read_toml
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.sim.scenario.scenario_file import scenario_text
 
