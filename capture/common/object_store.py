@@ -28,6 +28,7 @@ from .errors import (
     MissingExtraError,
     raised_as,
 )
+from .files import is_file
 from .parquet_trial import ParquetTrial
 
 _DIGITS = 32
@@ -134,8 +135,15 @@ class ObjectStore:
         Raises:
             InputFileError: If the folder can't be listed.
         """
-        infos, start = self._listed(folder), len(self.base) + 1
-        return sorted(i.path[start:] for i in infos if not i.is_file and i.path.endswith(ending))
+        if not self.is_local:
+            return []  # an object is nothing else
+        with raised_as(InputFileError, self.where, "", OSError):
+            try:
+                entries = [*os.scandir(self.path(folder))]
+            except FileNotFoundError:
+                return []
+        names = (e.name for e in entries if e.name.endswith(ending) and not is_file(Path(e)))
+        return sorted(f"{folder}/{name}" for name in names)
 
     def _listed(self, folder: str, *, recursive: bool = False) -> list[Any]:
         selector = self._fs_module.FileSelector(

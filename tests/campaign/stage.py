@@ -34,12 +34,12 @@ class Stage:
         self.folder, self.failing = folder, failing
         self._number = 0
         (folder / "bases").mkdir()
-        self.bases = make_bases(folder / "bases", self._result_of)
+        self.bases = make_bases(folder / "bases", self.result_of)
         self.bases += foreign_bases(folder / "bases" / "foreign")
         self.bases += bag_bases(folder / "bases" / "bags")
         self.warm_failures = self._warm()
 
-    def _result_of(self, gait):
+    def result_of(self, gait):
         """The JSON of ``undulog analyse`` for a session."""
         output = gait.with_suffix(".json")
         with self.fresh() as folder:

@@ -51,7 +51,12 @@ def test_a_folder_in_the_place_of_a_file_is_found(store, tmp_path):
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir()
     assert store.files("rows") == []
-    assert store.not_files("rows", ".parquet") == [name]
+    (tmp_path / "rows" / "2.parquet").symlink_to("nowhere")
+    (tmp_path / "rows" / "3.parquet").symlink_to("3.parquet")
+    others = ["rows/2.parquet", "rows/3.parquet"]
+    assert store.not_files("rows", ".parquet") == [name, *others]
+    for other in others:
+        assert not (tmp_path / store.set_aside(other, "damaged")).exists()
     with pytest.raises(DamagedFileError, match="folder"):
         store.read(name)
     goal = store.set_aside(name, "damaged")
