@@ -1,18 +1,15 @@
 """A catalogue of the sessions in a folder or under a URL.
 
-The catalogue lies beside the sessions, in the folder :data:`FOLDER`, as Parquet files of four
-kinds (:data:`.rows.SCHEMAS` and ``sources``). A scan reads what is new or changed, and adds files;
-none is ever changed, so any number of scans and analyses may write at once. Of several rows of one
-source those of the latest scan count.
+The catalogue lies beside the sessions as Parquet files (:mod:`.files`). A scan reads what is new or
+changed, and adds files; none is ever changed, so any number of scans and analyses may write at
+once. Of several rows of one source those of the latest scan count. Where a file of the catalogue is
+damaged, a scan reads all sources again and sets it aside.
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
 import tempfile
 import time
-import uuid
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -21,14 +18,10 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import active_children, get_context
 from pathlib import Path, PurePosixPath
 from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from undulog.capture.common.errors import (
     DataError,
@@ -38,37 +31,26 @@ from undulog.capture.common.errors import (
     UndulogError,
     UsageError,
 )
+from undulog.capture.common.object_store import ObjectStore
 from undulog.capture.common.process import StopRequest
-from undulog.capture.common.remote import ObjectStore
+from undulog.capture.common.untrusted_text import read_json
 from undulog.capture.common.waits import Standstill, processor_time
 from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts
 
-from .rows import (
-    SCHEMAS,
-    Row,
-    connect,
-    is_result,
-    put_together,
-    result_rows,
-    session_row,
-    sweep_rows,
-    table_of,
-)
-from .sources import FOLDER, Scanned, Source, list_sources, source_facts
-
-_ARROW: Any = pa  # comes without types
-_PARQUET: Any = pq
+from .files import CatalogFiles, settled
+from .rows import SCHEMAS, SWEPT, Row, is_result, result_rows, session_row, sweep_rows, table_of
+from .sources import Source, list_sources, source_facts
 
 _BATCH = 2000
 """Files that are read before their rows are written."""
 
-_MOST_FILES = 64
-"""Parquet files of a kind from which on they are put into one,"""
-_MOST_ROWS = 50_000
-"""and their rows."""
-
 _MOST_RESULT = 256 << 20
+"""Bytes of a result file; a larger one is none."""
+_MOST_SWEPT = 65_536
+"""Rows of a Parquet file of a sweep; one with more is none."""
+_FAULTS = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
+"""What values of other kinds than a result's end in."""
 _REMOTE_THREADS = 16
 STILL_S = 300.0
 """How long the processes that analyse may compute nothing [s]; a network drive that comes back does
@@ -77,6 +59,15 @@ _LOOK_S = 0.5
 _VERSION = 2  # of what is read of a file; those that an earlier one read are read again
 _UNREAD = -1  # a size that no file has
 _ANALYSED = "analysis of "
+_HALVES = """
+with own as (select source, session_id, joints, scanned_ns from all_analyses
+  where starts_with(source, $1)),
+parts as (select distinct source from all_joints where starts_with(source, $1))
+select source from own where joints > 0 and source not in (from parts)
+union select source from parts where source not in (select source from own)
+union select own.source from own join files on own.source = $1 || files.path
+  where files.modified_ns > own.scanned_ns
+"""
 
 
 @dataclass(frozen=True)
@@ -90,6 +81,7 @@ class ScanReport:
         damaged: Sessions without a whole summary, and results that can't be read.
         wall_s: How long it took [s].
         complete: Whether it came to its end.
+        set_aside: Files of the catalogue that were damaged, what was wrong and where they are now.
     """
 
     sessions: int
@@ -98,6 +90,7 @@ class ScanReport:
     damaged: int
     wall_s: float
     complete: bool
+    set_aside: tuple[str, ...] = ()
 
 
 class Catalog:
@@ -115,6 +108,7 @@ class Catalog:
         """
         self.where = str(where)
         self._store = ObjectStore(self.where)
+        self._files = CatalogFiles(self._store)
         if self._store.is_local and not Path(self._store.base).is_dir():
             raise InputFileError(where, "there is no such folder")
 
@@ -147,20 +141,15 @@ class Catalog:
 
         Raises:
             UsageError: If DuckDB can't run it.
+            DamagedFileError: If a file of the catalogue is damaged; a scan sets it aside.
             MissingExtraError: If DuckDB is not installed.
         """
-        for attempt in range(3):
-            try:
-                return self._sql(query)
-            except FileNotFoundError:  # another process put files together meanwhile
-                if attempt == 2:
-                    raise
-        raise AssertionError("unreachable")
+        return settled(lambda: self._sql(query))
 
     def _sql(self, query: str) -> Any:
         import duckdb
 
-        with self._database() as database:
+        with self._files.database() as database:
             try:
                 return database.execute(query).df()
             except duckdb.IOException as error:
@@ -186,18 +175,23 @@ class Catalog:
             on_read: Called with the number of files read and of those to read.
 
         Raises:
-            InputFileError: If the folder can't be listed.
+            InputFileError: If the folder can't be listed, or a file of the catalogue can't be read.
             LogWriteError: If the catalogue can't be written.
         """
         begun, stop = time.monotonic(), stop or StopRequest()
-        known, outdated = self._known()
+        damaged_files = self._files.find_damaged()
+        known, versions = settled(self._files.known)
+        outdated = {name for name in known if damaged_files or versions[name] != _VERSION}
+        mentioned = settled(self._files.mentioned) if damaged_files else {}
         listed = {file.name: file for file in list_sources(self._store, known)}
         # Later than all scans before, whatever the clocks of others say.
-        scanned_ns = max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
+        before_ns = [*(scanned for _, _, scanned in known.values()), *mentioned.values()]
+        scanned_ns = max([time.time_ns(), *(scanned + 1 for scanned in before_ns)])
         facts = {name: (file.size, file.modified_ns) for name, file in listed.items()}
         other = {name for name in listed if known.get(name, (0,))[:2] != facts[name]}
         fresh = [one for one in listed.values() if one.name in other | outdated]
-        gone = [name for name in known if name not in listed and not name.startswith(_ANALYSED)]
+        named = dict.fromkeys([*known, *(name.removeprefix(_ANALYSED) for name in mentioned)])
+        gone = [name for name in named if name not in listed]
         changed = [name for name in sorted(other) if listed[name].is_log and name in known]
         self._remove([*gone, *(_ANALYSED + name for name in (*gone, *changed))], scanned_ns)
         read = damaged = 0
@@ -217,13 +211,32 @@ class Catalog:
                 own = {"size": file.size, "fault": fault or None, "version": _VERSION}
                 sources.append(common | own | stamp)
             for kind, own in rows.items():
-                self._write(kind, table_of(kind, own))
-            self._write("sources", _ARROW.Table.from_pylist(sources, _SOURCES))
-        self._put_together()
-        n_sessions = sum(file.is_log for file in listed.values())
+                self._files.write(kind, own)
+            self._files.write("sources", sources)
+        complete, set_aside = read == len(fresh), list[str]()
+        if damaged_files and complete:
+            self._remove(self._halves(), scanned_ns)
+            set_aside = self._files.set_damaged_aside()
+        if complete:
+            self._files.put_together()
         return ScanReport(
-            n_sessions, read, len(gone), damaged, time.monotonic() - begun, read == len(fresh)
+            sessions=sum(file.is_log for file in listed.values()),
+            read=read,
+            removed=len(gone),
+            damaged=damaged,
+            wall_s=time.monotonic() - begun,
+            complete=complete,
+            set_aside=tuple(set_aside),
         )
+
+    def _halves(self) -> list[str]:
+        """Return analyses that were made for the catalogue and of which rows are lost, or outdated.
+
+        What a damaged file held is not known: rows of an analysis, rows of its joints, or that the
+        session has changed since.
+        """
+        with self._files.database() as database:
+            return [name for (name,) in database.execute(_HALVES, [_ANALYSED]).fetchall()]
 
     def analyse(
         self,
@@ -256,7 +269,7 @@ class Catalog:
                 faults[name] = outcome
                 continue
             self.add_result(_ANALYSED + name, outcome)
-        self._put_together()
+        self._files.put_together()
         return faults
 
     def add_result(self, source: str, result: Mapping[str, Any]) -> None:
@@ -272,24 +285,10 @@ class Catalog:
         """
         analysis, joints = _checked(source, result)
         stamp = {"source": source, "scanned_ns": time.time_ns(), "removed": False}
-        self._write("analyses", table_of("analyses", [analysis | stamp]))
-        self._write("joints", table_of("joints", [joint | stamp for joint in joints]))
+        self._files.write("analyses", [analysis | stamp])
+        self._files.write("joints", [joint | stamp for joint in joints])
 
     # -- inside ----------------------------------------------------------------------------------
-
-    def _known(self) -> tuple[dict[str, Scanned], set[str]]:
-        """Return the files that were read and are there, and those of an earlier version."""
-        latest: dict[str, tuple[int, int, int, bool, int | None]] = {}
-        for name in self._files("sources"):
-            table = self._store.read_table(name).to_pydict()
-            columns = [table[key] for key in _SCANNED]
-            columns.append(table.get("version", [None] * len(columns[0])))
-            for source, size, modified, scanned, removed, version in zip(*columns, strict=True):
-                if source not in latest or latest[source][2] < scanned:
-                    latest[source] = size, modified, scanned, removed, version
-        there = {name: facts for name, facts in latest.items() if not facts[3]}
-        outdated = {name for name, facts in there.items() if facts[4] != _VERSION}
-        return {name: facts[:3] for name, facts in there.items()}, outdated
 
     def _read_files(
         self, files: Sequence[Source]
@@ -311,7 +310,7 @@ class Catalog:
         except MissingExtraError as error:  # read again, when the extra may be there
             rows = [self._session(file, LogFacts(damage=str(error)))]
             return replace(file, size=_UNREAD), {"sessions": rows}, str(error)
-        except (UndulogError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (UndulogError, *_FAULTS, OSError) as error:
             facts = [LogFacts(damage=str(error))] if file.is_log else []
             return file, {"sessions": [self._session(file, one) for one in facts]}, str(error)
 
@@ -324,15 +323,22 @@ class Catalog:
         }
 
     def _sweep(self, file: Source) -> dict[str, list[Row]]:
-        every = map(sweep_rows, self._store.read_table(file.name).to_pylist())
+        # The folder may come from anyone, and so may the checksum.
+        table = self._store.read_table(file.name, SWEPT, tried=True)
+        if table.num_rows > _MOST_SWEPT:
+            return {}
+        every = map(sweep_rows, table.to_pylist())
         known = [found for found in every if found is not None]
         joints = [joint for _, own in known for joint in own]
-        return {"analyses": [analysis for analysis, _ in known], "joints": joints}
+        rows = {"analyses": [analysis for analysis, _ in known], "joints": joints}
+        for kind, own in rows.items():
+            table_of(kind, own)
+        return rows
 
     def _result(self, file: Source) -> dict[str, list[Row]]:
         if file.size > _MOST_RESULT:
             return {}
-        value = json.loads(self._store.read(file.name))
+        value = read_json(self._store.read(file.name))
         if not is_result(value):
             return {}
         analysis, joints = _checked(file.name, value)
@@ -342,8 +348,8 @@ class Catalog:
         gone = [{"source": name, "scanned_ns": scanned_ns, "removed": True} for name in names]
         for kind in SCHEMAS:
             own = [row | ({"path": row["source"]} if kind == "sessions" else {}) for row in gone]
-            self._write(kind, table_of(kind, own))
-        self._write("sources", _ARROW.Table.from_pylist(gone, _SOURCES))
+            self._files.write(kind, own)
+        self._files.write("sources", gone)
 
     def _analysed(
         self, names: Sequence[str], workers: int, stop: StopRequest
@@ -369,101 +375,13 @@ class Catalog:
                 advice = "they were ended; run the command again, which goes on with the rest"
                 raise NoAnswerError("the analyses of the sessions", STILL_S, advice)
 
-    def _files(self, kind: str) -> list[str]:
-        """Names of the Parquet files of a kind, without those that another one replaces."""
-        names = [file.name for file in self._store.files(f"{FOLDER}/{kind}", [".parquet"])]
-        replaced: set[str] = set()
-        for name in names:
-            if _is_base(name):
-                path, filesystem = self._store.path(name), self._store.filesystem
-                schema: Any = _PARQUET.read_schema(path, filesystem=filesystem)
-                replaced.update(json.loads(schema.metadata[b"replaces"]))
-        return [name for name in names if name not in replaced]
-
-    def _write(self, kind: str, table: Any, prefix: str = "rows") -> None:
-        if not table.num_rows:
-            return
-        self._store.make_folders(f"{FOLDER}/{kind}")
-        name = f"{FOLDER}/{kind}/{prefix}-{time.time_ns()}-{uuid.uuid4().hex[:8]}.parquet"
-        self._store.write_table(name, table)
-
-    def _database(self) -> AbstractContextManager[Any]:
-        base: dict[str, list[str]] = {}
-        new: dict[str, list[str]] = {}
-        for kind in SCHEMAS:
-            names = self._files(kind)
-            base[kind] = [name for name in names if _is_base(name)][-1:]
-            new[kind] = [name for name in names if name not in base[kind]]
-        return connect(self._store, base, new)
-
-    def _put_together(self) -> None:
-        """Put many small files into one; on an object store they stay as they are."""
-        if not self._store.is_local:
-            return
-        kinds = [kind for kind in (*SCHEMAS, "sources") if self._is_scattered(kind)]
-        if not kinds:
-            return
-        with _lock(Path(self._store.path(f"{FOLDER}/lock"))) as locked:
-            if not locked:
-                return
-            for kind in kinds:
-                names = self._files(kind)
-                if kind == "sources":
-                    table = _ARROW.concat_tables(
-                        [self._store.read_table(name) for name in names], promote_options="default"
-                    )
-                else:
-                    with self._database() as database:
-                        table = put_together(database, kind)
-                facts = {b"replaces": json.dumps(names).encode()}
-                self._write(kind, table.replace_schema_metadata(facts), "all")
-                for name in names:
-                    self._store.remove(name)
-
-    def _is_scattered(self, kind: str) -> bool:
-        new = [name for name in self._files(kind) if not _is_base(name)]
-        if len(new) >= _MOST_FILES:
-            return True
-        rows = [_PARQUET.read_metadata(self._store.path(name)).num_rows for name in new]
-        return sum(rows) >= _MOST_ROWS
-
-
-def _is_base(name: str) -> bool:
-    return PurePosixPath(name).name.startswith("all-")
-
-
-_SCANNED = "source", "size", "modified_ns", "scanned_ns", "removed"
-_SOURCES: Any = _ARROW.schema(
-    [
-        ("source", _ARROW.string()),
-        ("size", _ARROW.int64()),
-        ("modified_ns", _ARROW.int64()),
-        ("scanned_ns", _ARROW.int64()),
-        ("removed", _ARROW.bool_()),
-        ("fault", _ARROW.string()),
-        ("version", _ARROW.int64()),
-    ]
-)
-
-
-@contextmanager
-def _lock(path: Path) -> Generator[bool]:
-    """Hold a lock file; False where another process holds it."""
-    with path.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-            return
-        yield True
-
 
 def _checked(source: str, result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
     try:
         analysis, joints = result_rows(result)
         for kind, rows in (("analyses", [analysis]), ("joints", joints)):
             table_of(kind, rows)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except _FAULTS as error:
         raise DataError(f"{source}: a damaged result: {error!r}") from error
     return analysis, joints
 

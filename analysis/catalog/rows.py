@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import MissingExtraError
-from undulog.capture.common.remote import ObjectStore
+from undulog.capture.common.object_store import ObjectStore
 from undulog.capture.log.read.facts import LogFacts
 
 _ARROW: Any = pa  # comes without types
@@ -200,6 +200,12 @@ def _estimate(name: str, value: float | None, ci95: Sequence[float] | None) -> R
 
 
 _SWEPT = ("distance_m", "cost_of_transport", *_with_interval("frequency_hz", *INDICES))
+_OF_SWEPT_JOINTS = (*_JOINT_NUMBERS, *_with_interval("gain", "lag_rad"))
+SWEPT = (
+    *("status", "session_id", "answer", "sentence", "joint", "warnings", "changes"),
+    *(*_SWEPT, *_OF_SWEPT_JOINTS),
+)
+"""Columns of a sweep's rows that a catalogue takes."""
 
 
 def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
@@ -216,8 +222,7 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         "changes": row.get("changes"),
         **{name: row.get(name) for name in _SWEPT},
     }
-    numbers = (*_JOINT_NUMBERS, *_with_interval("gain", "lag_rad"))
-    columns = [name for name in numbers if isinstance(row.get(name), list)]
+    columns = [name for name in _OF_SWEPT_JOINTS if isinstance(row.get(name), list)]
     return analysis, [
         {
             "session_id": row["session_id"],

@@ -17,7 +17,7 @@ from typing import TypeAlias
 
 from undulog.capture.common.errors import InputFileError, UndulogError
 from undulog.capture.common.files import check_regular
-from undulog.capture.common.remote import ObjectStore, StoredFile
+from undulog.capture.common.object_store import ObjectStore, StoredFile
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
 from undulog.capture.log.file.parts import log_paths, walk

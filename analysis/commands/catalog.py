@@ -88,6 +88,8 @@ def catalog(
                     stop=stop, on_read=lambda k, n: bar.update(k / n, f"{k} of {n}")
                 )
             complete = report.complete
+            for text in report.set_aside:
+                complain(text)
         if analyse and complete:
             with progress("analyse", total=1) as bar:
                 faults = found.analyse(

@@ -18,7 +18,7 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.common.strict_table import read_toml
+from undulog.capture.common.untrusted_text import read_toml
 
 from ..body.free_motion import MotionFit
 from ..body.travel import body_steps, cost_of_transport, mean_of_cycles, speed

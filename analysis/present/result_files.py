@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_ty
 from undulog.capture.common.console import plain, refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError, UsageError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
+from undulog.capture.common.untrusted_text import read_json
 
 from ..experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
 from ..results import analysis, formats, oscillators
@@ -88,8 +89,8 @@ def load(path: Path | str) -> PresentedResult:
     """
     path = Path(path)
     try:
-        data: Any = json.loads(read_input(path).decode("utf-8"))
-    except (ValueError, RecursionError) as error:
+        data: Any = read_json(read_input(path))
+    except ValueError as error:
         raise DataError(f"{path}: not JSON: {error}") from error
     for kind in _KINDS:
         if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):

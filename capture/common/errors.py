@@ -9,6 +9,7 @@
     |  |- SettingsError                    settings of a recording, all faults listed
     |  `- JointSetError (DataError)        commands of another joint set than the robot's
     |- InputFileError (OSError)            a file to read that isn't there, or can't be read
+    |  `- DamagedFileError                 a stored file whose bytes aren't those that were written
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
     |- PlanError (ValueError)               a drive plan with faults, all listed
@@ -94,6 +95,10 @@ class _PathError(UndulogError):
 
 class InputFileError(_PathError, OSError):
     """A description, a model or a result that is missing or can't be read."""
+
+
+class DamagedFileError(InputFileError):
+    """A file of a store (rows of a sweep, a catalogue) that isn't what was written."""
 
 
 @dataclass(frozen=True)

@@ -25,40 +25,12 @@ NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 """What a name of a robot, link, joint or sensor looks like: it becomes part of topics and files."""
 
 
-_DEEPEST = 64
-"""Tables and arrays in each other; recursion over deeper ones would overflow the stack."""
-_INTEGERS = range(-(2**63), 2**63)
+_MOST_FAULTS = 200
+"""Faults of one file; nobody reads more, and each takes time to describe."""
+_LONGEST_TEXT = 2000
+"""Characters of a key, a value or a list of valid words in a message."""
 _SMALLEST = 1e-30
 """With the largest, 1e15: powers and quotients of quantities in SI units don't overflow."""
-
-
-def read_toml(text: str) -> dict[str, Any]:
-    """Read a TOML text of any origin.
-
-    Raises:
-        ValueError: If it is not TOML, has an integer of more than 64 bits, or nests tables and
-            arrays more than 64 deep.
-    """
-    import tomllib
-
-    try:
-        values = tomllib.loads(text)
-    except RecursionError:
-        raise ValueError(f"nested more than {_DEEPEST} deep") from None
-    level: list[object] = [values]
-    for _ in range(_DEEPEST):
-        inner: list[object] = []
-        for value in level:
-            if isinstance(value, dict):
-                inner += cast("dict[str, object]", value).values()
-            elif isinstance(value, list):
-                inner += cast("list[object]", value)
-            elif isinstance(value, int) and value not in _INTEGERS:
-                raise ValueError("an integer of more than 64 bits")
-        if not inner:
-            return values
-        level = inner
-    raise ValueError(f"nested more than {_DEEPEST} deep")
 
 
 def shown(value: object) -> str:
@@ -69,8 +41,11 @@ def shown(value: object) -> str:
         return str(value).lower()
     if isinstance(value, str):
         return f'"{value}"'
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return _cut(str(value), 60)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def listed(words: Iterable[str], found: object = None) -> str:
@@ -130,18 +105,24 @@ _USUAL = Bound("0 or of a size from 1e-30 to", 1e15)
 
 
 class Faults:
-    """The faults found so far, in order, each once."""
+    """The faults found so far, in order, each once; of very many the first ones."""
 
     def __init__(self) -> None:
         """Start with none."""
         self._faults: dict[Fault, None] = {}
 
+    @property
+    def full(self) -> bool:
+        """Whether there are so many that no further one is noted."""
+        return len(self._faults) >= _MOST_FAULTS
+
     def add(self, key: str, found: str, valid: str) -> None:
-        """Note a fault."""
-        self._faults[Fault(key, found, valid)] = None
+        """Note a fault, long texts cut."""
+        if not self.full:
+            self._faults[Fault(*(_cut(text, _LONGEST_TEXT) for text in (key, found, valid)))] = None
 
     def all(self) -> tuple[Fault, ...]:
-        """Return all faults, in the order found."""
+        """Return all faults, in the order found, at most 200."""
         return tuple(self._faults)
 
 
@@ -321,6 +302,8 @@ class Table:
         good: dict[str, None] = {}
         for i, word in enumerate(cast("list[object]", value)):
             where = f"{self.look(key)[0]}[{i}]"
+            if self.faults.full:
+                break
             if not isinstance(word, str):
                 self.faults.add(where, shown(word), "a string")
             elif choices is not None and word not in choices:
@@ -359,6 +342,8 @@ class Table:
     def close(self) -> None:
         """Note every key of this table that was not read."""
         for key in self.values:
+            if self.faults.full:
+                return
             if key not in self._asked:
                 self.faults.add(self.key(key), "an unknown key", listed(self._asked, key))
 

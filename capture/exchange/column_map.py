@@ -35,7 +35,8 @@ from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..common.config import Positive, read_field
 from ..common.errors import Fault, FaultyFileError, UsageError
 from ..common.files import read_input
-from ..common.strict_table import NAME_PATTERN, NONZERO, Faults, Table, listed, read_toml
+from ..common.strict_table import NAME_PATTERN, NONZERO, Faults, Table, listed
+from ..common.untrusted_text import read_toml
 from ..log.write.channels import JointStateChannel
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, unit_for, valid_units

@@ -11,7 +11,6 @@ Layout: https://github.com/huggingface/lerobot, ``lerobot/datasets``.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from ..common.arrays import NS
 from ..common.errors import ImportFormatError, LogError, UsageError, some_names
 from ..common.process import StopRequest
+from ..common.untrusted_text import read_json
 from ..log.read.facts import TIMES_FROM_FPS
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
@@ -42,6 +42,9 @@ _MOST_INFO = 1 << 24  # bytes
 _MOST_JOINTS = 1024
 _MOST_TASKS = 1 << 16
 _ROWS = 1 << 17
+_LEAST_EPISODE = 64
+"""Bytes of a file for each episode in it; real ones take kilobytes. Numbers alone pack to nothing,
+and each would become a session."""
 _KNOWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 """Features of every dataset that number its frames."""
 
@@ -70,14 +73,18 @@ class LeRobotDataset:
         return sorted(self.folder.glob("data/*/*.parquet"))
 
     def episodes(self) -> dict[int, list[Path]]:
-        """Return the episodes that are there and the files that hold their frames."""
+        """Return the episodes that are there and the files that hold their frames.
+
+        Raises:
+            ImportFormatError: If a file is damaged, or numbers more episodes than it can hold.
+        """
         found: dict[int, list[Path]] = {}
         for path in self.files():
-            numbers = {
-                number
-                for block in self.reader.blocks(path, ["episode_index"], _ROWS)
-                for number in np.unique(_integers(path, block, "episode_index")).tolist()
-            }
+            numbers, most = set[int](), path.stat().st_size // _LEAST_EPISODE
+            for block in self.reader.blocks(path, ["episode_index"], _ROWS):
+                numbers.update(np.unique(_integers(path, block, "episode_index")).tolist())
+                if len(numbers) > most:
+                    refuse(path, f"numbers over {most} episodes, more than its bytes can hold")
             for episode in numbers:
                 found.setdefault(episode, []).append(path)
         if not found:
@@ -100,7 +107,7 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
     try:
         if path.stat().st_size > _MOST_INFO:
             raise ImportFormatError(path, "is too large")
-        info = json.loads(path.read_text(encoding="utf-8"))
+        info = read_json(path.read_bytes())
         features = cast("dict[str, Any]", info["features"])
         fps = float(info["fps"])
         names = {name: _element_names(features[name]) for name in FEATURES if name in features}
@@ -109,7 +116,7 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
     except LogError:
         raise
     except (
-        OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError
+        OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError
     ) as error:  # fmt: skip
         raise ImportFormatError(path, f"is no description of a LeRobot dataset: {error}") from error
     if not names or not 1e-3 <= fps <= 1e6:
@@ -269,7 +276,7 @@ def _task(dataset: LeRobotDataset, path: Path, number: int) -> str:
         lines = dataset.folder / "meta" / "tasks.jsonl"
         if lines.is_file():
             with lines.open(encoding="utf-8") as stream:
-                entries = (json.loads(line) for line in stream if line.strip())
+                entries = (read_json(line) for line in stream if line.strip())
                 return str(next(e["task"] for e in entries if e["task_index"] == wanted))
         listing = dataset.folder / "meta" / "tasks.parquet"
         (tasks,) = dataset.reader.blocks(listing, None, _MOST_TASKS, most=1)

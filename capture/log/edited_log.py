@@ -25,7 +25,7 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, LogError, UndulogError, UsageError
 from ..common.files import Closing, part_file
 from ..common.process import StopRequest
-from ..common.strict_table import read_toml
+from ..common.untrusted_text import read_toml
 from .file.content import sha256_of
 from .file.log_file import LogFile
 from .mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records

@@ -265,7 +265,7 @@ class ControlClient:
         try:
             reply = cast("dict[str, Any]", json.loads(line))
             reply["ok"] = bool(reply["ok"])
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ControlError(f"{self.path}: what answers there is no recorder") from error
         return reply
 

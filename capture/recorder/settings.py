@@ -45,7 +45,8 @@ from typing import Any, TypeVar, cast
 from ..common.amounts import SIZE_UNITS, parse_duration_s, parse_size
 from ..common.errors import DataError, SettingsError
 from ..common.files import is_file, read_input
-from ..common.strict_table import Faults, listed, read_toml, shown
+from ..common.strict_table import Faults, listed, shown
+from ..common.untrusted_text import read_toml
 
 _Number = TypeVar("_Number", int, float)
 

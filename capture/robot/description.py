@@ -35,7 +35,8 @@ from typing import Any
 from ..common.config import read, read_field, read_fields, read_required
 from ..common.errors import Fault, RobotFileError
 from ..common.files import Shelf, check_regular
-from ..common.strict_table import Faults, Table, listed, read_toml
+from ..common.strict_table import Faults, Table, listed
+from ..common.untrusted_text import read_toml
 from .bus_map import read_bus
 from .kinematics import MESH_TYPES, mesh_type, read_meshes
 from .model import (

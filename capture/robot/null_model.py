@@ -27,6 +27,7 @@ from ..common.config import Name, NonNegative, Positive, read, read_field, write
 from ..common.errors import Fault, NullModelError
 from ..common.files import read_input, write_text
 from ..common.strict_table import Faults, Table
+from ..common.untrusted_text import read_json
 
 FORMAT = "undulog null model 1"
 
@@ -144,8 +145,8 @@ def read_null_model(path: Path) -> NullModel:
         NullModelError: If it has faults; lists all of them.
     """
     try:
-        values: Any = json.loads(read_input(path).decode("utf-8"))
-    except (ValueError, RecursionError) as error:
+        values: Any = read_json(read_input(path))
+    except ValueError as error:
         raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
     if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:
         raise NullModelError(path, [Fault("format", "no such format", f'"{FORMAT}"')])

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from ..common.config import declared
-from ..common.strict_table import above, read_toml
+from ..common.strict_table import above
+from ..common.untrusted_text import read_toml
 from .model import Servo
 
 RUN_RECORD = "undulog.run"

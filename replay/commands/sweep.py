@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit, progress
+from undulog.capture.common.console import complain, emit, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -35,8 +35,9 @@ def sweep(
 
     A plan names a scenario, the parameters and their design (grid, random or Sobol). Rows are kept
     by a hash of everything that determines them: an interrupted sweep goes on where it stopped, an
-    extended one runs only what is new. A run that fails keeps its error. Exit code 1: interrupted,
-    or every run failed.
+    extended one runs only what is new. A run that fails keeps its error. Damaged files of rows are
+    moved to the folder `damaged` there, and their runs made again. Exit code 1: interrupted, rows
+    that can't be read, or every run failed.
 
     Example: `undulog sweep strength.toml -o strength --workers 2`
 
@@ -81,6 +82,7 @@ def sweep(
             retry=retry_failed,
             stop=stop,
             on_row=count,
+            on_damage=complain,
         )
     facts = {**asdict(report), "complete": report.complete}
     emit(facts, _report_lines(report), as_json=json)
@@ -88,13 +90,18 @@ def sweep(
 
 
 def _report_lines(report: SweepReport) -> list[str]:
-    rows = f"{report.there_before + report.run} of {report.planned} runs"
+    rows = f"{report.planned - report.missing} of {report.planned} runs"
     lines = [f"{report.output}: {rows}, {report.run} of them now in {report.wall_s:.1f} s"]
     if report.failed:
         example = f", e.g. {report.error}" if report.error else ""
         lines.append(f"{report.failed} failed; the column error gives the reason{example}")
+    if report.damaged:
+        count = len(report.damaged)
+        lines.append(f"{count} damaged file{'s' if count > 1 else ''} of rows set aside")
     if not report.complete:
-        lines.append("Interrupted; the same command goes on.")
+        ended = report.there_before + report.run < report.planned
+        why = "Interrupted" if ended else f"{report.missing} rows were damaged meanwhile"
+        lines.append(f"{why}; the same command goes on.")
     return lines
 
 
@@ -111,6 +118,8 @@ def _cost_lines(plan: Path, sweep: PreparedSweep, cost: SweepCost) -> list[str]:
             f"About {length} at {cost.workers} runs at a time, {cost.run_s:.2g} s a run as "
             "measured on the first one"
         )
+    if cost.damaged:
+        lines.append(f"Damaged, with runs to make again: {', '.join(cost.damaged)}")
     if cost.error:
         lines.append(f"The first one fails: {cost.error}")
     return lines

@@ -13,7 +13,8 @@ from rerun.components import FillMode
 
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
-from undulog.capture.common.strict_table import Faults, Table, read_toml
+from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world

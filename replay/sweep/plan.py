@@ -41,7 +41,8 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.config import Count, Positive, read_fields
 from undulog.capture.common.errors import Fault, PlanError
 from undulog.capture.common.files import read_input
-from undulog.capture.common.strict_table import Faults, Table, at_least, read_toml
+from undulog.capture.common.strict_table import Faults, Table, at_least
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.sim.scenario.scenario import Kernels
 
 MOST_RUNS = 1_000_000

@@ -30,7 +30,8 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.config import read
 from undulog.capture.common.errors import Fault, PlanError, RobotFileError, UndulogError, UsageError
-from undulog.capture.common.strict_table import Faults, Table, read_toml
+from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.scenario import Kernels, Scenario

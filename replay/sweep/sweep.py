@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from undulog.capture.common.process import StopRequest
-from undulog.capture.common.strict_table import read_toml
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.sim.scenario.scenario_file import scenario_text
 
@@ -64,6 +64,7 @@ class SweepCost:
         run_s: Processor time of the first run, measured [s]; None where all are there.
         estimated_s: Time that the rest takes [s].
         error: Why the first run failed, or empty.
+        damaged: Files of rows that can't be read; their runs are to be made again.
     """
 
     planned: int
@@ -72,6 +73,7 @@ class SweepCost:
     run_s: float | None
     estimated_s: float
     error: str = ""
+    damaged: tuple[str, ...] = ()
 
     @property
     def to_run(self) -> int:
@@ -91,7 +93,9 @@ class SweepReport:
         failed: Those that failed, now or before.
         wall_s: How long it took [s].
         run_s: Time in runs, summed over the workers [s].
+        missing: Those without a row that can be read, at the end.
         error: The first one of those that were run now and failed, or empty.
+        damaged: Files of rows that were damaged, what was wrong and where they are now.
     """
 
     output: str
@@ -101,12 +105,14 @@ class SweepReport:
     failed: int
     wall_s: float
     run_s: float
+    missing: int
     error: str = ""
+    damaged: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
-        """Whether every run of the plan has a row."""
-        return self.there_before + self.run == self.planned
+        """Whether every run of the plan has a row that can be read."""
+        return not self.missing
 
 
 def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
@@ -167,7 +173,8 @@ def cost_of(sweep: PreparedSweep, store: RowStore, workers: int) -> SweepCost:
         run_s, error = float(row["run_wall"]), str(row["error"])
     planned = len(sweep.jobs)
     estimated_s = len(jobs) * (run_s or 0.0) / max(1, min(workers, len(jobs)))
-    return SweepCost(planned, planned - len(jobs), workers, run_s, estimated_s, error)
+    there, damaged = planned - len(jobs), tuple(store.damaged)
+    return SweepCost(planned, there, workers, run_s, estimated_s, error, damaged)
 
 
 def run_sweep(
@@ -179,14 +186,19 @@ def run_sweep(
     retry: bool = False,
     stop: StopRequest | None = None,
     on_row: Callable[[Row, int], None] = lambda _row, _there: None,
+    on_damage: Callable[[str], None] = lambda _text: None,
 ) -> SweepReport:
     """Run what a sweep's store does not hold yet.
+
+    Every file of rows is compared with its checksum before the first run and after the last one.
+    Damaged ones are set aside, and those found before the first run have their runs made again.
 
     Args:
         workers: Processes of this computer, or how many; by default one a processor.
         cluster: Address of a Dask scheduler, to run there instead.
         retry: Whether runs that failed are run again.
         on_row: Called with each new row and the number of those that were there before.
+        on_damage: Called with what is wrong with each damaged file, and where it is now.
 
     Raises:
         InputFileError: If the store can't be read.
@@ -196,8 +208,9 @@ def run_sweep(
     """
     start, stop = time.monotonic(), stop or StopRequest()
     run, run_s, error = 0, 0.0, ""
+    damaged: list[str] = []
     with store.writing():
-        there = store.facts()
+        there = _checked(store, damaged, on_damage)
         jobs = _missing(sweep, there, retry=retry)
         store.drop(job.key for job in jobs if job.key in there)
         store.settle(sweep.digest, sweep.setting.facts())
@@ -221,8 +234,31 @@ def run_sweep(
                 run_s += row.get("run_wall", 0.0)
                 on_row(row, before)
         store.gather()
-    wall_s = time.monotonic() - start
-    return SweepReport(store.where, len(sweep.jobs), before, run, failed, wall_s, run_s, error)
+        there = _checked(store, damaged, on_damage)
+    missing = sum(job.key not in there for job in sweep.jobs)
+    return SweepReport(
+        output=store.where,
+        planned=len(sweep.jobs),
+        there_before=before,
+        run=run,
+        failed=failed,
+        wall_s=time.monotonic() - start,
+        run_s=run_s,
+        missing=missing,
+        error=error,
+        damaged=tuple(damaged),
+    )
+
+
+def _checked(
+    store: RowStore, damaged: list[str], on_damage: Callable[[str], None]
+) -> dict[str, Row]:
+    """Return the rows that can be read; set damaged files aside and add them to a list."""
+    there = store.facts()
+    for text in store.set_damaged_aside():
+        damaged.append(text)
+        on_damage(text)
+    return there
 
 
 def _missing(sweep: PreparedSweep, there: Mapping[str, Row], *, retry: bool) -> list[Job]:

@@ -312,12 +312,12 @@ def show(scenario: str, /, *, json: bool = False) -> None:
         scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
         json: Print one JSON object: each key with value and unit.
     """
-    import tomllib
+    from undulog.capture.common.untrusted_text import read_toml
 
     from ..scenario.scenario_file import load_scenario
 
     found = load_scenario(scenario)
-    every = dict(leaves(tomllib.loads(found.toml())))
+    every = dict(leaves(read_toml(found.toml())))
     values = {
         key: {"value": value, "unit": unit_of(key) if _is_number(value) else ""}
         for key, value in every.items()

@@ -55,7 +55,8 @@ import numpy as np
 from undulog.capture.common.config import Name, NonNegative, read_field
 from undulog.capture.common.errors import Fault, PlanError
 from undulog.capture.common.files import is_file
-from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import WALK, GaitTick, Modulation, Readings

@@ -95,7 +95,8 @@ from typing import Any, cast
 from undulog.capture.common.config import read, read_field
 from undulog.capture.common.errors import Fault, ScenarioError, UsageError
 from undulog.capture.common.files import Description, Shelf, is_file
-from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed
+from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.capture.robot.model import Plane, Robot
 

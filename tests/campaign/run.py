@@ -30,6 +30,7 @@ from . import (
     injection,
     interruptions,
     kills,
+    results,
     servers,
 )
 from .case import Result
@@ -80,6 +81,7 @@ PARTS = {
     "conversions": Part(conversions.run, 500, 10),
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
+    "results": Part(results.run, 2_000, 15),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),

@@ -35,7 +35,7 @@ class Stage:
         self.folder, self.failing = folder, failing
         self._number = 0
         (folder / "bases").mkdir()
-        self.bases = make_bases(folder / "bases", self._result_of)
+        self.bases = make_bases(folder / "bases", self.result_of)
         self.bases += foreign_bases(folder / "bases" / "foreign")
         bags = bag_bases(folder / "bases" / "bags")
         database = next(one for one in bags if one.name == "bare.db3")
@@ -43,7 +43,7 @@ class Stage:
         self.bases += binary_bases(folder / "bases" / "binary", database.files["bare.db3"])
         self.warm_failures = self._warm()
 
-    def _result_of(self, gait):
+    def result_of(self, gait):
         """The JSON of ``undulog analyse`` for a session."""
         output = gait.with_suffix(".json")
         with self.fresh() as folder:

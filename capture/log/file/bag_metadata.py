@@ -13,6 +13,7 @@ from pathlib import Path, PurePath
 from typing import Any, cast
 
 from ...common.errors import NotALogError
+from ...common.untrusted_text import check_yaml
 
 METADATA = "metadata.yaml"
 LARGEST_METADATA = 1 << 20
@@ -78,6 +79,7 @@ def read_stated(folder: Path) -> Stated:
     path = folder / METADATA
     text = metadata_text(path)
     try:
+        check_yaml(text)
         # Kinds other than text would be computed: merges of merges expand without limit.
         tree: Any = cast("Any", YAML(typ="base", pure=True)).load(text)
     except Exception as error:  # its parser has errors of many bases

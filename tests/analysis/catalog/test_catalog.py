@@ -20,7 +20,8 @@ from support.bucket import s3_bucket
 from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.written_sessions import joint_state, write_foreign, write_session
-from undulog.analysis.catalog.catalog import FOLDER, Catalog
+from undulog.analysis.catalog.catalog import Catalog
+from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError, NotALogError, UsageError
 from undulog.capture.log.read.facts import MOST_REQUESTS, read_facts
@@ -254,7 +255,8 @@ def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(la
     catalog.scan()
     for path in (lab / FOLDER / "sources").iterdir():
         table = pq.read_table(path).drop_columns("version")
-        pq.write_table(table, path)
+        pq.write_table(table, path.with_name("rows-1790000000000000000-0123abcd.parquet"))
+        path.unlink()
     before = catalog.find()
     assert catalog.scan().read == 4
     pd.testing.assert_frame_equal(catalog.find(), before)
@@ -290,7 +292,7 @@ def test_many_writers_at_once_lose_no_row(lab):
 
 
 def test_rows_that_were_put_together_but_not_removed_count_once(lab, monkeypatch):
-    monkeypatch.setattr("undulog.analysis.catalog.catalog._MOST_FILES", 2)
+    monkeypatch.setattr("undulog.analysis.catalog.files._MOST_FILES", 2)
     catalog = Catalog(str(lab))
     catalog.scan()
     write_session(lab / "new.mcap", count=20)

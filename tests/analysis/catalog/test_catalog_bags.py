@@ -11,7 +11,8 @@ from rosbags.rosbag2 import StoragePlugin
 
 from support.ros_bags import BY_FILE, BY_MESSAGE, Filler, filling, ticks, write_bag
 from support.written_sessions import write_session
-from undulog.analysis.catalog.catalog import FOLDER, Catalog
+from undulog.analysis.catalog.catalog import Catalog
+from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError
 

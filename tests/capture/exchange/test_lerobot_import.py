@@ -98,6 +98,21 @@ def test_one_episode_into_one_file(tmp_path, command, opened):
         import_lerobot(folder, tmp_path / "y.mcap", episode=7)
 
 
+def test_numbers_of_episodes_without_their_bytes_are_refused(tmp_path, command):
+    """A million numbers take 35 kB, and each would become a session."""
+    folder, count = dataset(tmp_path / "set", "v3.0"), 1_000_000
+    path = folder / "data" / "chunk-000" / "file-000.parquet"
+    zeros = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(2 * count, np.float32)), 2)
+    columns = {"action": zeros, "observation.state": zeros, "frame_index": np.zeros(count, int)}
+    numbers = pa.table({**columns, "episode_index": np.arange(count)})
+    options = {"use_dictionary": False, "column_encoding": {"episode_index": "DELTA_BINARY_PACKED"}}
+    pq.write_table(numbers, path, compression="zstd", **options)
+    assert path.stat().st_size < 100_000
+    shown = command("import", folder, "-o", tmp_path / "out", code=1).err
+    assert "more than its bytes can hold" in shown
+    assert not list((tmp_path / "out").glob("*"))
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"features": {"action": 1}, "fps": 30}'])
 def test_a_damaged_description_is_named(text, tmp_path):
     folder = dataset(tmp_path / "set", "v2.1")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 
 import pandas as pd
@@ -195,6 +196,51 @@ def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     report = json.loads(out)
     assert (report["run"], report["failed"], err) == (10, 0, "")
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
+
+
+def bad_rows(folder):
+    """Flip 40 bytes of a row file."""
+    path = min((folder / "rows").iterdir())
+    data = bytearray(path.read_bytes())
+    for at in range(60, 100):
+        data[at] ^= 0x10
+    path.write_bytes(data)
+
+
+@pytest.mark.slow
+def test_damaged_rows_are_reported_set_aside_and_run_again(reference, tmp_path):
+    shutil.copytree(reference / "rows", tmp_path / "rows")
+    bad_rows(tmp_path / "rows")
+    words = ("sweep", reference / "plan.toml", "-o", tmp_path / "rows", "--workers", "1")
+    shown = undulog(*words, "--dry-run").stdout
+    assert "to run: 10" in shown
+    assert "Damaged, with runs to make again: rows/" in shown
+    done = undulog(*words)
+    assert done.returncode == 0
+    assert "checksum" in done.stderr
+    assert "moved to damaged/" in done.stderr
+    assert "10 of 10 runs, 10 of them now" in done.stdout
+    assert "1 damaged file of rows set aside" in done.stdout
+    assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
+    assert len(pd.read_parquet(tmp_path / "rows" / "rows")) == 10
+
+
+@pytest.mark.slow
+def test_rows_damaged_during_the_sweep_are_not_called_complete(tmp_path):
+    plan = read_plan(write_plan(tmp_path, (0.2,)))
+    store = RowStore(str(tmp_path / "rows"))
+    first = run_sweep(prepare(plan, tmp_path, store.where), store, workers=1)
+    assert first.complete
+    longer = read_plan(write_plan(tmp_path, (0.2, 0.3)))
+    report = run_sweep(
+        prepare(longer, tmp_path, store.where),
+        store,
+        workers=1,
+        on_row=lambda _row, _before: bad_rows(tmp_path / "rows"),
+    )
+    assert (report.complete, report.missing, len(report.damaged)) == (False, 1, 1)
+    again = run_sweep(prepare(longer, tmp_path, store.where), store, workers=1)
+    assert (again.complete, again.run, again.damaged) == (True, 1, ())
 
 
 @pytest.mark.slow
