@@ -24,6 +24,7 @@ from ..robot.model import Robot
 from ..sources.contract import EndingSource, Polled, Source, SourceContext
 from ..sources.serial_port import SerialSource
 from .bus_recorder import BusRecorder
+from .links import SourceLink, links_of
 from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
 
@@ -55,11 +56,13 @@ class Ending:
     """Why a recording ended.
 
     Attributes:
-        failed: Whether it had to end.
+        failed: Whether it had to end, or lacks what it was started for.
+        requested: Whether a client of the control socket ended it.
     """
 
     reason: str
     failed: bool = False
+    requested: bool = False
 
 
 class Recorder:
@@ -70,6 +73,7 @@ class Recorder:
         overruns: Number of ticks left out after one that took too long.
         ending: Set by a task to end the recording.
         watched: Whether a live view is connected.
+        links: Connection of each source, by its name.
         priority: Priority of the recorder's threads.
     """
 
@@ -100,6 +104,7 @@ class Recorder:
         self.priority = Priority("not asked for")
         self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
         self.buses: dict[str, BusRecorder] = {}
+        self.links: dict[str, SourceLink] = links_of(sources)
         self._writer, self._clock, self._context = writer, clock, context
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
@@ -303,6 +308,7 @@ class Recorder:
         try:
             polled = source.poll()
             _check(polled)
+            self.links[source.name].note(source, polled)
         except LogWriteError:
             raise
         except Exception as error:  # noqa: BLE001 - the other sources go on
