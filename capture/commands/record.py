@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..recorder.recording import RecordReport
     from ..recorder.settings import RecordSettings
     from ..recorder.status import RecorderSnapshot
+    from ..recorder.systemd import Notifier
 
 
 _UNITS = Path("/etc/systemd/system")
@@ -99,24 +100,26 @@ def record(
     options = locals()  # the arguments, by name
     from ..common.process import interruptible
     from ..recorder.settings import PARSERS, resolve
+    from ..recorder.systemd import Notifier
 
     resolved = resolve({name: options[name] for name in PARSERS}, os.environ, settings)
+    notifier = Notifier(os.environ)
     with interruptible() as stop:
-        report = _run(resolved, stop)
+        report = _run(resolved, stop, notifier)
     emit(report.as_json(), () if resolved.quiet else _lines(report), as_json=json)
     if report.ending.failed:
         complain(f"error: {report.ending.reason}")
-    return int(report.ending.failed)
+    # A service that ends as failed is started again, which its user did not request.
+    return int(report.ending.failed and not (report.ending.requested and notifier.is_service))
 
 
-def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
+def _run(settings: RecordSettings, stop: StopRequest, notifier: Notifier) -> RecordReport:
     from ..recorder.recording import Recording
     from ..recorder.screen import Terminal
-    from ..recorder.systemd import Notifier
 
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
-        recording = Recording(settings, stop, notifier=Notifier(os.environ))
+        recording = Recording(settings, stop, notifier=notifier)
         watch = _live_view(recording.live_socket, relay) if settings.live else str
 
         def show(snapshot: RecorderSnapshot) -> None:

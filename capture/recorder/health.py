@@ -19,7 +19,7 @@ from ..common.arrays import NS
 from ..common.errors import DataError
 from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
-from ..log.health.tallies import BusHealth, JointHealth
+from ..log.health.tallies import BusHealth, JointHealth, Timing
 from ..log.mcap.batch import MessageBatch, MessageFields
 from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
@@ -210,22 +210,35 @@ class LiveHealth:
 
     def topics(self) -> tuple[TopicSnapshot, ...]:
         """Return the topics with messages at the last scan, by name."""
+        result = self.result()
         joints: dict[str, list[JointHealth]] = {}
-        for joint in self.result().joints:
+        for joint in result.joints:
             joints.setdefault(joint.topic, []).append(joint)
+        timings: dict[str, list[Timing]] = {}
+        for series in result.series:
+            timings.setdefault(series.topic, []).append(series.timing)
         found = [
-            self._topic(topic, self._measured[key], joints.get(topic.name, []))
+            self._topic(
+                topic,
+                self._measured[key],
+                timings.get(topic.name, []),
+                joints.get(topic.name, []),
+            )
             for key, topic in self._topics.items()
             if key in self._measured
         ]
         return tuple(sorted(found, key=lambda topic: topic.topic))
 
     def _topic(
-        self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
+        self,
+        topic: _Topic,
+        measured: ChannelMeasures,
+        rhythms: list[Timing],
+        joints: list[JointHealth],
     ) -> TopicSnapshot:
         # Messages of frames are written per batch, without a rhythm of their own.
         framed = topic.name.startswith((*FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX))
-        timings = [] if framed else [series.timing for series in measured.series]
+        timings = [] if framed else rhythms
         steady = [timing for timing in timings if timing.regular]
         jitters = [(timing.std_s or 0.0) / timing.median_s for timing in steady if timing.median_s]
         whole = bool(steady) and len(steady) == len(timings)

@@ -21,9 +21,10 @@ from ..log.messages.frames import FD_FRAME_DTYPE, FRAME_DTYPE, FrameArray
 from ..log.write.channels import TimeReferenceChannel
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
-from ..sources.contract import ConnectedSource, EndingSource, Polled, Source, SourceContext
+from ..sources.contract import EndingSource, Polled, Source, SourceContext
 from ..sources.serial_port import SerialSource
 from .bus_recorder import BusRecorder
+from .links import SourceLink, links_of
 from .pauses import Pause, PauseWatch
 from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
@@ -69,11 +70,13 @@ class Ending:
     """Why a recording ended.
 
     Attributes:
-        failed: Whether it had to end.
+        failed: Whether it had to end, or lacks what it was started for.
+        requested: Whether a client of the control socket ended it.
     """
 
     reason: str
     failed: bool = False
+    requested: bool = False
 
 
 class Recorder:
@@ -84,6 +87,7 @@ class Recorder:
         overruns: Number of ticks left out after one that took too long.
         ending: Set by a task to end the recording.
         watched: Whether a live view is connected.
+        links: Connection of each source, by its name.
         priority: Priority of the recorder's threads.
     """
 
@@ -114,6 +118,7 @@ class Recorder:
         self.priority = Priority("not asked for")
         self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
         self.buses: dict[str, BusRecorder] = {}
+        self.links: dict[str, SourceLink] = links_of(sources)
         self._writer, self._clock, self._context = writer, clock, context
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
@@ -355,12 +360,6 @@ class Recorder:
         return frames[before]
 
     @property
-    def lost_links(self) -> list[str]:
-        """Names of the sources whose connection broke and has not come back."""
-        sources = (source for source in self._sources if isinstance(source, ConnectedSource))
-        return sorted(source.name for source in sources if source.lost)
-
-    @property
     def given_up(self) -> list[str]:
         """Names of the sources that failed unexpectedly."""
         return sorted(self._failed)
@@ -372,6 +371,7 @@ class Recorder:
         try:
             polled = source.poll()
             _check(polled)
+            self.links[source.name].note(source, polled)
         except LogWriteError:
             raise
         except Exception as error:  # noqa: BLE001 - the other sources go on

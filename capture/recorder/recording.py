@@ -30,6 +30,7 @@ from .control import ControlServer
 from .control_client import default_sockets
 from .control_requests import RequestHandler
 from .health import LiveHealth
+from .links import SourceLink, link_faults
 from .live_feed import LiveFeed
 from .loop import Ending, Recorder
 from .screen import plain_line
@@ -270,7 +271,7 @@ class Recording:
 
     def stop(self) -> None:
         """End the recording after this tick."""
-        self._recorder.ending = Ending("it was stopped")
+        self._recorder.ending = Ending("it was stopped", requested=True)
 
     # -- in the loop -------------------------------------------------------------------------
 
@@ -359,9 +360,17 @@ class Recording:
             # A twin's time is its own: it gets the duration, and ends by itself.
             twins = all(source.robot is not None for source in self._sources)
             duration_s = None if twins else self._settings.duration_s
-            return self._recorder.run(self._stop, duration_s)
+            ending = self._recorder.run(self._stop, duration_s)
+            for fault in (faults := link_faults(self._links())):
+                self._recorder.log_event("error", "recorder", fault)
         except LogWriteError as error:
             return Ending(str(error), failed=True)
+        return _failed(ending, *faults) if faults else ending
+
+    def _links(self) -> dict[str, SourceLink]:
+        """Return the links of all sources but those given up, which have a report of their own."""
+        given_up = self._recorder.given_up
+        return {name: link for name, link in self._recorder.links.items() if name not in given_up}
 
     def _finalised(self, ending: Ending) -> Ending:
         """Write verdict and summary, and close; return the ending, or the error in it."""
@@ -379,7 +388,8 @@ class Recording:
                 self._writer.close()
             except LogWriteError as error:
                 full = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
-                ending = Ending(full if ending.failed else str(error), failed=True)
+                text = full if ending.failed else str(error)
+                ending = dataclasses.replace(ending, reason=text, failed=True)
         return ending
 
     def _diagnose_last(self, ending: Ending) -> None:
@@ -430,13 +440,8 @@ class Recording:
     def _report(self, ending: Ending) -> RecordReport:
         measures = self._health.result()
         files = self._storage.files()
-        for what, lost in (
-            ("given up before", self._recorder.given_up),
-            ("lost and not back", self._recorder.lost_links),
-        ):
-            if lost:
-                text = f"{ending.reason}; {what}, see /rosout: {', '.join(lost)}"
-                ending = Ending(text, failed=True)
+        if lost := self._recorder.given_up:
+            ending = _failed(ending, f"given up before, see /rosout: {', '.join(lost)}")
         return RecordReport(
             files=files,
             session_id=self._session_id,
@@ -450,6 +455,11 @@ class Recording:
             sources={s.name: dataclasses.asdict(s.counts) for s in self._sources},
             recorder=self._recorder_facts(ending),
         )
+
+
+def _failed(ending: Ending, *faults: str) -> Ending:
+    """Return an ending that failed for further reasons."""
+    return dataclasses.replace(ending, reason="; ".join((ending.reason, *faults)), failed=True)
 
 
 def _storage_of(settings: RecordSettings) -> DurableSink | RingStorage:

@@ -42,6 +42,11 @@ class Notifier:
         self._next_beat_ns = 0
         self._status = ""
 
+    @property
+    def is_service(self) -> bool:
+        """Whether a service manager runs this process."""
+        return self._address is not None
+
     def ready(self, status: str = "") -> None:
         """Report that the recording has begun; ``status`` is for ``systemctl status``."""
         self._send("READY=1", *self._status_line(status))

@@ -77,6 +77,15 @@ def events(path):
         return [(message.name, message.msg) for _, message in session.messages("/rosout")]
 
 
+@contextmanager
+def connected_sender(path):
+    """A sender at a source ``unix:PATH``, as soon as it is there, that has sent one frame."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
+        wait_for(lambda: sender.connect_ex(str(path)) == 0, "the source")
+        sender.send(empty_frames(1).tobytes())
+        yield sender
+
+
 def send(path, frames, per_packet=50, pause_s=0.01, stamp=False):
     """Send frames to a source ``unix:PATH``, as soon as it is there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
+from ..messages import COMMAND_TOPIC
 from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from ..read.facts import TIMES_FROM_FPS
@@ -66,6 +67,10 @@ _MOST_LISTED = 8
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
+OFFSET_TOPICS = ("/joint_sample_offset", "/joint_command_offset")
+"""Offsets of the joints' sampling times, one message a stamp of the topic that they belong to: its
+rhythm is judged."""
+
 RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
 """Topics of a recorder's own messages, which have no steady rate: an event may be logged late, and
 a clock that was not read again repeats its last stamp."""
@@ -94,6 +99,7 @@ class Fault:
         gaps: Number of gaps; 0 for a fault of another kind.
         lost_ns: Begin and end of the longest gap [Unix ns].
         part: Share of the samples that are missing in the gaps.
+        late: Whether the gaps are late cycles, in which nothing is missing.
     """
 
     weight: int
@@ -103,6 +109,7 @@ class Fault:
     gaps: int = 0
     lost_ns: tuple[int, int] = (0, 0)
     part: float = 0.0
+    late: bool = False
 
 
 def joined(faults: Iterable[Fault]) -> list[Finding]:
@@ -134,7 +141,7 @@ def joined(faults: Iterable[Fault]) -> list[Finding]:
 
 def _one_loss(one: Fault, other: Fault) -> bool:
     """Whether the gaps of two channels are of one loss: equal in number, the longest overlap."""
-    if not one.gaps or (one.weight, one.gaps) != (other.weight, other.gaps):
+    if not one.gaps or (one.weight, one.gaps, one.late) != (other.weight, other.gaps, other.late):
         return False
     (begin, end), (start, stop) = one.lost_ns, other.lost_ns
     return 2 * (min(end, stop) - max(begin, start)) > min(end - begin, stop - start)
@@ -145,7 +152,7 @@ def _finding(group: Sequence[Fault]) -> Finding:
     where = _where(group)
     if len(group) == 1:
         return Finding(worst.weight, f"{where}: {worst.text}")
-    each = "lost together: at most" if worst.gaps else "each:"
+    each = f"{'late' if worst.late else 'lost'} together: at most" if worst.gaps else "each:"
     return Finding(worst.weight, f"{where}, {each} {worst.text}")
 
 
@@ -213,7 +220,7 @@ def judge_channel(health: ChannelHealth) -> Iterator[Fault]:
 
 def has_rhythm(topic: str) -> bool:
     """Whether the rhythm of a topic is judged."""
-    return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
+    return topic not in (*VIEW_AIDS, *OFFSET_TOPICS) and not topic.startswith(RECORDER_TOPICS)
 
 
 def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[Fault]:
@@ -234,7 +241,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[F
     span_s = (timing.last_ns - timing.first_ns) / NS
     mostly_paused = joints and timing.paused_s >= BAD_PAUSE * span_s
     if timing.gaps:
-        yield _gaps(health, when, mostly_paused=mostly_paused)
+        yield from _gaps(health, when, mostly_paused=mostly_paused)
     elif joints and timing.paused_s:
         text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
         yield Fault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
@@ -246,29 +253,46 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[F
     if timing.backward:
         yield Fault(1, label, "", f"{timing.backward} stamps go back in time")
     if timing.duplicates:
-        weight = int(timing.duplicates > GOOD_LOSS * timing.count)
+        caught_up = health.topic == COMMAND_TOPIC and timing.late  # several cycles at once
+        weight = int(timing.duplicates > GOOD_LOSS * timing.count and not caught_up)
         yield Fault(weight, label, "", f"{timing.duplicates} stamps are repeated")
     if health.nan and not joints:
         weight = int(health.nan > GOOD_LOSS * health.numbers)
         yield Fault(weight, label, "", f"{health.nan} of {health.numbers} numbers are not a number")
 
 
-def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
-    """Return the fault of the gaps of a series."""
+def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[Fault]:
+    """Yield the faults of the gaps of a series: lost samples, and a sender that was late."""
     timing = health.timing
+    lost, longest = timing.gaps - timing.late, f"the longest is {timing.longest_s:.3g} s, {when}"
     long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * (timing.median_s or 0.0)
-    scattered = timing.scattered / (timing.count + timing.scattered)
-    lost = scattered >= BAD_LOSS or mostly_paused
-    return Fault(
-        2 if lost else int(timing.missing_part > GOOD_LOSS or long),
-        health.label,
-        "",
-        f"{timing.gaps} gaps, {timing.missing} samples missing ({timing.missing_part:.2%}); "
-        f"the longest is {timing.longest_s:.3g} s, {when}",
-        timing.gaps,
-        (timing.longest_at_ns, timing.longest_at_ns + round(timing.longest_s * NS)),
-        timing.missing_part,
-    )
+    where = (timing.longest_at_ns, timing.longest_at_ns + round(timing.longest_s * NS))
+    if lost:
+        scattered = timing.scattered / (timing.count + timing.scattered)
+        yield Fault(
+            2
+            if scattered >= BAD_LOSS or mostly_paused
+            else int(timing.missing_part > GOOD_LOSS or long),
+            health.label,
+            "",
+            f"{lost} gaps, {timing.missing} samples missing ({timing.missing_part:.2%}); {longest}",
+            lost,
+            where,
+            timing.missing_part,
+        )
+    if timing.late:
+        cycles = "command cycles" if health.topic == COMMAND_TOPIC else "cycles"
+        yield Fault(
+            int(long and not lost),
+            health.label,
+            "",
+            f"{timing.late} late {cycles} of the sender ({timing.late / timing.count:.2%} of the "
+            f"samples), none lost in them; {longest}",
+            timing.late,
+            where,
+            timing.late / timing.count,
+            late=True,
+        )
 
 
 def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:

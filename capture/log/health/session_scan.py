@@ -34,6 +34,7 @@ from .rules import (
     judge_topics,
     verdict_of,
 )
+from .skipped_cycles import with_skipped_cycles
 from .tallies import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
@@ -204,6 +205,7 @@ class SessionScan:
             if scan.ends is not None and scan.kind is not None
             for source in measure_sources(scan.kind, *scan.ends)
         )
+        series = with_skipped_cycles(series, channels, sources, self._commands)
         types = {channel.topic: channel.type_name for channel in channels}
         chain = self._robot.joint_names if self._robot is not None else ()
         seen = [joint.name for joint in joints if joint.topic == self._states]

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...common.arrays import NS, IntArray
+from ...common.arrays import NS, FloatArray, IntArray
+from .gaps import GapCauses, Intervals, causes_of
 
 GAP_PERIODS = 1.5
 """An interval longer than this many median intervals is a gap: the nearest whole number of
@@ -38,6 +39,7 @@ _BINS_PER_OCTAVE = 64
 _QUANTILES = (0.25, 0.5, 0.75, 0.99)
 _OCTAVES = 48  # 1 ns to 78 h
 _BINS = _BINS_PER_OCTAVE * _OCTAVES
+_EXACT = 256  # longest intervals that are kept as they are: a long gap's bin is wider than a period
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,9 @@ class Timing:
         p99_s: 99 % point of all intervals [s].
         regular: Whether gaps can be told from the rhythm.
         gaps: Intervals longer than :data:`GAP_PERIODS` medians; 0 where irregular.
-        missing: Samples that would fill the gaps; 0 where irregular.
+        missing: Samples that were lost in the gaps; 0 where irregular.
         scattered: Those of them that are not in pauses.
+        late: Gaps in which nothing was lost, as the sender itself was late (:mod:`.gaps`).
         paused_s: All pauses together [s]; also of an irregular series.
         longest_s: Longest interval [s].
         longest_at_ns: Where the longest interval starts [Unix ns].
@@ -76,6 +79,7 @@ class Timing:
     longest_at_ns: int
     duplicates: int
     backward: int
+    late: int = 0
 
     @property
     def rate_hz(self) -> float | None:
@@ -102,6 +106,7 @@ class TimingTally:
         self._longest = (0, 0)
         self._bins = np.empty(0, np.int64)  # those that have intervals, ascending
         self._sums = np.empty((3, 0))  # number, sum and sum of squares of their intervals [ns]
+        self._largest = np.empty(0)  # the longest intervals [ns], ascending
 
     def add(self, t_ns: IntArray) -> None:
         """Take the next samples.
@@ -130,7 +135,8 @@ class TimingTally:
         if int(steps[longest]) > self._longest[0]:  # of equal ones the first, as they came
             self._longest = int(steps[longest]), int(starts[longest])
         size = steps.astype(np.float64)
-        bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
+        self._largest = np.sort(np.concatenate([self._largest, size]))[-_EXACT:]
+        bins = _bins(size)
         had = len(self._bins)
         self._bins, place = np.unique(np.concatenate([self._bins, bins]), return_inverse=True)
         sums = np.zeros((3, len(self._bins)))
@@ -144,7 +150,7 @@ class TimingTally:
         number, total, squares = self._sums
         intervals = int(number.sum())
         median = std = p99 = None
-        regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
+        regular, gaps, paused, causes = False, 0, 0.0, GapCauses(0, 0, 0)
         if intervals:
             mean = total / number
             places = np.searchsorted(np.cumsum(number), np.array(_QUANTILES) * intervals)
@@ -152,10 +158,17 @@ class TimingTally:
             regular = intervals >= MIN_INTERVALS and high - low <= REGULAR_SPREAD * median
             long = (mean > GAP_PERIODS * median) & regular
             gaps = int(number[long].sum())
-            lost = number * np.rint(mean / median - 1) * long
             pause = mean > max(PAUSE_S * NS, PAUSE_PERIODS * median)
-            missing, scattered = int(lost.sum()), int(lost[~pause].sum())
             paused = float(total[pause].sum())
+            if gaps:
+                every, place = self._intervals()
+                causes = causes_of(
+                    every,
+                    long[place],
+                    pause[place],
+                    span_ns=self._last - self._first,
+                    count=self._count,
+                )
             n = number[~long].sum()
             centre = total[~long].sum() / n
             std = float(np.sqrt(max(squares[~long].sum() / n - centre**2, 0.0)))
@@ -168,14 +181,35 @@ class TimingTally:
             p99_s=None if p99 is None else p99 / NS,
             regular=regular,
             gaps=gaps,
-            missing=missing,
-            scattered=scattered,
+            missing=causes.missing,
+            scattered=causes.scattered,
+            late=causes.late,
             paused_s=paused / NS,
             longest_s=self._longest[0] / NS,
             longest_at_ns=self._longest[1],
             duplicates=self._duplicates,
             backward=self._backward,
         )
+
+    def _intervals(self) -> tuple[Intervals, IntArray]:
+        """Return all intervals, the longest as they are, and the bin of each, by its place."""
+        number, total, _ = self._sums
+        place = np.searchsorted(self._bins, _bins(self._largest))
+        rest = number - np.bincount(place, minlength=len(number))
+        rest_total = total - np.bincount(place, self._largest, len(number))
+        kept = np.flatnonzero(rest)
+        mean = np.concatenate([rest_total[kept] / rest[kept], self._largest])
+        spread = np.where(rest[kept] > 1, 1.0 / _BINS_PER_OCTAVE, 0.0)
+        order = np.argsort(mean, kind="stable")
+        counts = np.concatenate([rest[kept], np.ones(len(place))])
+        spreads = np.concatenate([spread, np.zeros(len(place))])
+        every = Intervals(counts[order], mean[order], spreads[order])
+        return every, np.concatenate([kept, place])[order]
+
+
+def _bins(size_ns: FloatArray) -> IntArray:
+    """Return the bins of intervals [ns], shape (n,)."""
+    return np.minimum((np.log2(size_ns) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pytest
 
 from support.paths import ROOT
 from support.processes import run, wait_for
-from support.recorders import command, ended, events, polling, recording, send
+from support.recorders import command, connected_sender, ended, events, polling, recording, send
 from support.written_frames import frames_of
 from undulog.capture import Session
 from undulog.capture.common.process import StopRequest
@@ -113,8 +113,7 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_a_whole_file(number, tmp_path, output, bus):
-    with recording(output, f"unix:{bus}") as process:
-        wait_for(bus.exists, "the source's socket")
+    with recording(output, f"unix:{bus}") as process, connected_sender(bus):
         report, err = ended(process, number)
     assert (process.returncode, err) == (0, "")
     assert report["ended"] == f"{number.name} was received"

@@ -14,6 +14,7 @@ from support import processes
 from support.processes import UNDULOG, python, wait_for
 from support.processes import undulog as undulog_command
 from support.read_back import decoded_of
+from support.recorders import connected_sender
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
 PATIENCE_S = 60.0
@@ -32,7 +33,7 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture
 def recorder(place):
-    """Starts recorders of a source that nobody feeds, and waits until they can be asked."""
+    """Starts recorders of a source with one silent sender, and waits until they can be asked."""
     with contextlib.ExitStack() as started:
 
         def start(name, *options):
@@ -40,6 +41,7 @@ def recorder(place):
             words = (f"unix:{place}/{name}.frames", "-o", place / f"{name}.mcap", "--quiet")
             process = started.enter_context(processes.process(*UNDULOG, "record", *words, *options))
             wait_for(lambda: len(find_sockets(os.environ)) > running, alive=[process])
+            started.enter_context(connected_sender(place / f"{name}.frames"))
             return process
 
         yield start

@@ -15,8 +15,7 @@ import pytest
 
 from support import recorders
 from support.paths import ROOT
-from support.processes import wait_for
-from support.recorders import counts, ended, events, greet, recording, send
+from support.recorders import connected_sender, counts, ended, events, greet, recording, send
 from support.written_frames import frames_of
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
@@ -172,8 +171,7 @@ def test_a_decoder_that_always_fails_ends_in_bounded_time(tmp_path, monkeypatch)
 def test_a_duration_ends_sources_of_simulated_time(tmp_path):
     bus = tmp_path / "bus.sock"
     words = (f"can0=unix:{bus}?clock=simulated", "--duration", "1.5")
-    with recording(tmp_path / "run.mcap", *words) as process:
-        wait_for(bus.exists, "the source's socket")
+    with recording(tmp_path / "run.mcap", *words) as process, connected_sender(bus):
         report, _ = ended(process)
     assert process.returncode == 0
     assert report["ended"] == "1.5 s are over"

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from support.processes import process, run, undulog
+from support.recorders import connected_sender
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder.systemd import UNIT_NAME, hidden_folder, installed_program, unit_text
 
@@ -176,9 +177,10 @@ def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(servi
     asked = control(tmp_path / "runtime", "status", "--json")
     assert asked.returncode == 0, asked.stderr
     assert '"state": "recording"' in asked.stdout
-    process.send_signal(signal.SIGTERM)
-    heard(manager, "STOPPING=1")
-    output, errors = process.communicate(timeout=PATIENCE_S)
+    with connected_sender(tmp_path / "frames.sock"):
+        process.send_signal(signal.SIGTERM)
+        heard(manager, "STOPPING=1")
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert output == "", "--quiet"
     assert (tmp_path / "state" / "run.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
@@ -198,6 +200,26 @@ def test_a_loop_that_hangs_feeds_its_watchdog_no_more(service):
         pytest.fail("its watchdog is fed")
     process.send_signal(signal.SIGCONT)
     heard(manager, "WATCHDOG=1")
+
+
+@pytest.mark.slow
+def test_a_service_whose_robot_never_came_ends_as_failed_unless_it_was_stopped_on_request(
+    service, tmp_path
+):
+    process, manager = service()
+    heard(manager, "READY=1")
+    asked = control(tmp_path / "runtime", "stop", "--wait")
+    assert (asked.returncode, asked.stderr) == (1, "")
+    assert "source frames was never connected" in asked.stdout
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert "source frames was never connected" in errors
+    assert process.returncode == 0, "systemd would start the recording again"
+    (tmp_path / "state" / "run.mcap").unlink()
+    process, manager = service()
+    heard(manager, "READY=1")
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
 
 
 def test_wrong_settings_end_with_2_so_that_they_are_not_tried_again(service):
