@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from . import contention, disks, gate, hostile, injection, kills, servers
+from . import contention, disks, gate, hostile, injection, kills, marks, servers
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
 from .stage import Stage
@@ -68,12 +68,13 @@ PARTS = {
     "disks": Part(disks.run, 400, 15),
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
+    "marks": Part(marks.run, 100, 3),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 35_214, 120),
+    "mutated": Part(mutated, 35_114, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 

@@ -26,6 +26,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
+from ...common.part_files import stored_path
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
 from ..file.content import content_id, content_id_of
@@ -226,7 +227,8 @@ def read_bag_facts(path: Path) -> LogFacts:
 
 def is_wal_alone(path: Path) -> bool:
     """Return whether a session's file is missing or empty, and its write-ahead log is there."""
-    is_empty = not path.exists() or (path.is_file() and not path.stat().st_size)
+    stored = stored_path(path)
+    is_empty = not stored.exists() or (stored.is_file() and not stored.stat().st_size)
     return is_empty and wal_folder(path).is_dir()
 
 
