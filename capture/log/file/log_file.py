@@ -217,9 +217,10 @@ class LogFile(Contents):
                 self._join_wal(wal)
             self.warnings += self.parts.missing
             if self._unfinished and self.recovered is None:
+                fix = RECOVER if self.files[-1].cut else "; it is whole: rename it"
                 self.warnings.append(
-                    f"{', '.join(self._unfinished)} has not got its final name: its writer was ended, or is "
-                    f"still writing{RECOVER if self.files[-1].cut else '; it is whole: rename it'}"
+                    f"{', '.join(self._unfinished)} has not got its final name: its writer was "
+                    f"ended, or is still writing{fix}"
                 )
             if any(block.end_ns > LAST_NS for block in self.blocks):
                 self.warnings.append(
