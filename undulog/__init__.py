@@ -10,6 +10,7 @@ import errno
 import gc
 import os
 import sys
+from codecs import lookup
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -311,10 +312,11 @@ def run(arguments: Sequence[str]) -> int:
         if known is None:
             raise
         return _complain(str(known), known.exit_code)
-    except OSError as error:  # a file that vanished or a disk that failed, at any moment
-        if error.filename is None or error.errno == errno.ENAMETOOLONG:
+    except (OSError, UnicodeEncodeError) as error:
+        fault = _file_fault(error)
+        if fault is None:
             raise
-        return _complain(f"{error.filename}: {error.strerror}", 1)
+        return _complain(fault, 1)
     except KeyboardInterrupt:
         return _complain("interrupted", 1)
     return result if isinstance(result, int) else 0
@@ -322,6 +324,9 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
+    from undulog.capture.common.streams import prepare_streams
+
+    prepare_streams()
     if "--help" in sys.argv:
         gc.disable()  # a seventh of the time, and the process ends with the help
     if not sys.stderr.isatty():
@@ -385,6 +390,21 @@ def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
         else:
             left.append(word)
     return left
+
+
+def _file_fault(error: OSError | UnicodeEncodeError) -> str | None:
+    """What is wrong with a file, if it is a file's fault."""
+    if isinstance(error, OSError):  # a file that vanished or a disk that failed, at any moment
+        if error.filename is None or error.errno == errno.ENAMETOOLONG:
+            return None
+        return f"{error.filename}: {error.strerror}"
+    names = lookup(error.encoding).name, lookup(sys.getfilesystemencoding()).name
+    if names[0] != names[1] or names[0] == "utf-8":
+        return None
+    return (
+        f"{error.object}: in this locale ({error.encoding}) a file's name can't have "
+        f"{error.object[error.start]!r}; set LC_ALL=C.UTF-8"
+    )
 
 
 def _unknown(arguments: Sequence[str]) -> str:

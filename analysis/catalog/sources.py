@@ -18,6 +18,7 @@ from typing import TypeAlias
 from undulog.capture.common.errors import InputFileError, UndulogError
 from undulog.capture.common.files import check_regular
 from undulog.capture.common.object_store import ObjectStore, StoredFile
+from undulog.capture.common.part_files import stored_path
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
 from undulog.capture.log.file.parts import log_paths, walk
@@ -91,8 +92,9 @@ def source_facts(store: ObjectStore, source: Source) -> LogFacts:
         return read_bag_facts(plain)
     if plain.is_dir():
         plain = next(plain.glob("*.mcap"))
-    check_regular(plain)
-    with open(plain, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered
+    stored = stored_path(plain)
+    check_regular(stored)
+    with open(stored, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered
         own = stream.fileno()
         size = os.fstat(own).st_size
         return read_facts(str(plain), size, lambda a, b: os.pread(own, b - a, a))
@@ -149,7 +151,7 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
     if not name.isprintable() and name != name.encode(errors="replace").decode():
         raise InputFileError(path, "its name is not UTF-8, which a catalogue needs; rename it")
     try:
-        at = wal_folder(path) if is_log and is_wal_alone(path) else path
+        at = wal_folder(path) if is_log and is_wal_alone(path) else stored_path(path)
         facts = at.stat()
         own = [facts]
         if S_ISDIR(facts.st_mode):

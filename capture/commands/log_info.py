@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.console import emit, progress
 from ..common.errors import DataError, UsageError
+from ..common.part_files import SUFFIX
 from ..log.file.content import session_label
 from ..log.messages.definitions import CONTRACT_VERSION
 from .sessions import Line, each, sessions_of, show, stated_gait
@@ -124,6 +125,8 @@ def _info_line(path: Path) -> Line:
     with Session.open(path) as session:
         facts, gait = describe(session), stated_gait(session.metadata)
     first = next(_info_lines(facts)).removeprefix(f"{_label(facts['session'])}: ")
+    left = next((text for text in facts["warnings"] if SUFFIX in text), "")
+    first = left or first  # a file that a killed writer left
     robot, verdict = facts["session"]["robot"] or "", facts["session"]["verdict"] or ""
     return Line(robot, gait, verdict, first, facts)
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .errors import OutputExistsError, UsageError
+from .part_files import recording_left
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -124,15 +125,17 @@ def refuse_existing(path: Path, *, force: bool) -> None:
         force: Whether an existing file may be replaced.
 
     Raises:
-        OutputExistsError: If it is there and ``force`` is not given.
+        OutputExistsError: If it is there, or what a killed recorder left of it, and ``force`` is
+            not given.
         UsageError: If it is a folder, or its folder doesn't exist.
     """
     if path.is_dir():
         raise UsageError(f"{path} is a folder; name a file in it")
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the folder {path.parent} doesn't exist")
-    if path.exists() and not force:
-        raise OutputExistsError(path)
+    there = path if path.exists() else recording_left(path)
+    if there is not None and not force:
+        raise OutputExistsError(there)
 
 
 UNLIMITED = 10_000

@@ -29,6 +29,7 @@ from .errors import (
     UndulogError,
     UsageError,
 )
+from .part_files import claimed_part, publish_durably
 
 if TYPE_CHECKING:
     import socket
@@ -193,27 +194,39 @@ def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool)
 
 
 @contextmanager
-def part_file(output: Path) -> Generator[Path]:
+def part_file(output: Path, *, durable: bool = False) -> Generator[Path]:
     """Write ``OUTPUT.part``, and rename it on leaving without an exception.
+
+    Two processes that write one output at the same time have part files of their own: the output is
+    that of the last one, whole.
 
     Args:
         output: The file wanted; one of that name is replaced, so callers that must not replace it
             ask :func:`.capture.common.console.refuse_existing` before they start.
+        durable: Whether it survives power loss: the file and its name are synced.
+
+    Yields:
+        The part file, which is there, empty.
 
     Raises:
         LogWriteError: If it can't be written; nothing is left behind then.
     """
-    part = output.with_name(f"{output.name}.part")
     try:
-        yield part
-        part.replace(output)
+        with claimed_part(output) as part:
+            try:
+                yield part
+                if durable:
+                    publish_durably(part, output, replace=True)
+                else:
+                    part.replace(output)
+            except BaseException:
+                with suppress(OSError):  # what stopped the writing may stop this too
+                    part.unlink(missing_ok=True)
+                raise
     except OSError as error:
         if isinstance(error, UndulogError):
             raise
         raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):  # what stopped the writing may stop this too
-            part.unlink(missing_ok=True)
 
 
 @contextmanager

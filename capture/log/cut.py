@@ -20,6 +20,7 @@ from typing import Any
 from mcap.records import Channel
 
 from ..common.errors import DataError, LogError, MissingChannelError, UsageError
+from ..common.part_files import stored_path
 from ..common.process import StopRequest
 from .edited_log import (
     EDIT_RECORD,
@@ -35,6 +36,7 @@ from .edited_log import (
     portable,
     refuse_output,
 )
+from .file.log_file import RECOVER
 from .file.parts import first_part
 from .messages.definitions import adds_up, is_latched
 from .wal.writer import wal_folder
@@ -247,10 +249,7 @@ def recover_log(
         found = source.file.recovered
         if found is not None and found.live:
             raise LogError(path, "this recording is running; end it first")
-        if found is not None:  # without the advice to recover it
-            source.warnings = [
-                str(found) if text == found.warning else text for text in source.warnings
-            ]
+        source.warnings = [text.partition(RECOVER)[0] for text in source.warnings]
         with edited_log([source], output, force=force, stop=stop) as log:
             for attachment in source.attachments:
                 log.attach(attachment, attachment.name)
@@ -283,8 +282,9 @@ def recover_log(
     if found is None and not source.warnings:
         report.notes.append("the log was whole: nothing had to be recovered")
     if found is None and cut:
+        beside = stored_path(first).name
         report.notes.append(
-            f"there is no {wal.name} beside {first.name}, the write-ahead log that a killed "
+            f"there is no {wal.name} beside {beside}, the write-ahead log that a killed "
             "recorder leaves: where the file is a copy, copy that folder, too, and recover again"
         )
     return report

@@ -24,6 +24,7 @@ from ..common.arrays import NS
 from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, LogError, UndulogError, UsageError
 from ..common.files import Closing, part_file
+from ..common.part_files import stored_path
 from ..common.process import StopRequest
 from ..common.untrusted_text import read_toml
 from .file.content import sha256_of
@@ -399,7 +400,7 @@ def edited_log(
     read = [path for source in sources for path in (source.path, *source.file.parts.paths)]
     refuse_output(output, read, force=force)
     profiles = {source.file.profile for source in sources}
-    with part_file(output) as part:
+    with part_file(output, durable=True) as part:  # the sources may be deleted then
         with part.open("wb") as stream:
             log = EditedLog(stream, profiles.pop() if len(profiles) == 1 else "")
             yield log
@@ -419,8 +420,9 @@ def refuse_output(output: Path, sources: Sequence[Path], *, force: bool) -> None
     """
     if output.suffix.lower() != ".mcap":
         raise UsageError(f"{output}: a log is an .mcap file, not {output.suffix or 'nameless'}")
-    for source in sources:
-        if output.exists() and source.exists() and output.samefile(source):
+    there = stored_path(output)
+    for source in map(stored_path, sources):
+        if there.exists() and source.exists() and there.samefile(source):
             raise UsageError(f"{output} is a source; an edit always writes a new file")
     refuse_existing(output, force=force)
 

@@ -23,6 +23,7 @@ from undulog.capture.common.errors import (
     UndulogError,
     UsageError,
 )
+from undulog.capture.common.part_files import claimed_part
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.write.mcap_sink import write_error
 from undulog.capture.log.write.writer import SessionWriter
@@ -129,12 +130,13 @@ def open_session(
     """
     output = Path(path)
     refuse_existing(output, force=force)
-    part = output.with_name(f"{output.name}.part")
     with ExitStack() as stack:
-        stack.callback(_remove, part)
-        stack.push(partial(_name, part, output))
-        writer = stack.enter_context(
-            SessionWriter(
+        try:
+            part = stack.enter_context(claimed_part(output))
+        except OSError as error:
+            raise write_error(output, error) from error
+        try:
+            writer = SessionWriter(
                 part,
                 session_id=_session_id(scenario, driver, kernels),
                 epoch_ns=scenario.epoch_ns,
@@ -146,7 +148,11 @@ def open_session(
                 },
                 force=True,
             )
-        )
+        except BaseException:
+            _remove(part)
+            raise
+        stack.push(partial(_name, part, output))
+        stack.enter_context(writer)
         if driver is not None:
             writer.explain(driver.attachments, driver.records)
         yield writer
@@ -164,13 +170,15 @@ def _name(
     error: BaseException | None,
     _trace: TracebackType | None,
 ) -> None:
-    """Give a session its name, unless it could not be written."""
+    """Give a session its name, or remove it if it could not be written."""
     if isinstance(error, LogWriteError):
+        _remove(part)
         return
     try:
         part.replace(output)
-    except OSError as found:
-        raise write_error(output, found) from found
+    except OSError as failure:
+        _remove(part)
+        raise write_error(output, failure) from failure
 
 
 def _session_id(scenario: Scenario, driver: Driver | None, kernels: Kernels) -> str:

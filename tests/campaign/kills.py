@@ -78,8 +78,7 @@ def run(seed, stage):
         if by == signal.SIGINT:  # before the command has begun Python itself answers
             result.failures = [one for one in result.failures if not one.endswith("[?]")]
         leaves_a_log = recording and (folder / "new.mcap.wal").exists()
-        if not leaves_a_log:
-            result.failures += whole_outputs(folder)
+        result.failures += whole_outputs(folder)
         if not outcome.killed:
             return result
         if leaves_a_log:

@@ -30,6 +30,7 @@ from . import (
     injection,
     interruptions,
     kills,
+    marks,
     results,
     servers,
 )
@@ -82,13 +83,14 @@ PARTS = {
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
     "results": Part(results.run, 2_000, 15),
+    "marks": Part(marks.run, 100, 3),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "binary": Part(partial(mutated, part="binary"), 4_500, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 30_714, 120),
+    "mutated": Part(mutated, 30_554, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ...common.files import check_regular
+from ...common.part_files import finished_path
 
 _PIECE = 4 << 10  # few bytes, because a server has to be asked for them
 _PIECES = 4
@@ -60,7 +61,8 @@ def sha256_of(paths: Iterable[Path]) -> str:
     """Return the SHA-256 of the contents of files, one after the other."""
     total = hashlib.sha256()
     for path in paths:
-        with path.open("rb") as stream:
+        # A part file may have got its final name since it was opened.
+        with (path if path.exists() else finished_path(path)).open("rb") as stream:
             hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
 

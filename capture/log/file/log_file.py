@@ -22,7 +22,8 @@ from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
 from ...common.errors import LogError, NotALogError
-from ...common.remote import as_path
+from ...common.part_files import SUFFIX, stored_path
+from ...common.remote import RemotePath, as_path
 from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import Contents, McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
@@ -111,6 +112,10 @@ class FilePages:
         self._used = bool(held)  # once more after the last one: it takes milliseconds
 
 
+RECOVER = "; 'undulog log recover' writes a whole file"
+"""Advice at the end of a warning."""
+
+
 @dataclass(frozen=True)
 class Recovered:
     """Contents of a session that was not finalised.
@@ -120,6 +125,7 @@ class Recovered:
         in_files: Number of messages in the files.
         from_wal: Number of messages that only the write-ahead log has.
         accepted: Number of messages that the recorder accepted; None if unknown.
+        unfinished: Names of the part files that were being written.
         looked: Whether all messages were counted by reading; if not, summaries were used, or a part
             of the write-ahead log can't be read.
     """
@@ -130,6 +136,7 @@ class Recovered:
     from_wal: int
     accepted: int | None
     looked: bool
+    unfinished: tuple[str, ...] = ()
 
     @property
     def missing(self) -> int | None:
@@ -141,8 +148,8 @@ class Recovered:
     @property
     def warning(self) -> str:
         """One sentence, with the fix."""
-        advice = "" if self.live else "; 'undulog log recover' writes a whole file"
-        return f"{self}{advice}"
+        left = ", ".join((*self.unfinished, self.folder.name))
+        return f"{self}{'' if self.live else f'{RECOVER} from {left}'}"
 
     def __str__(self) -> str:
         """Return one sentence."""
@@ -209,6 +216,12 @@ class LogFile(Contents):
             if wal is not None and not self.foreign_wal:
                 self._join_wal(wal)
             self.warnings += self.parts.missing
+            if self._unfinished and self.recovered is None:
+                fix = RECOVER if self.files[-1].cut else "; it is whole: rename it"
+                self.warnings.append(
+                    f"{', '.join(self._unfinished)} has not got its final name: its writer was "
+                    f"ended, or is still writing{fix}"
+                )
             if any(block.end_ns > LAST_NS for block in self.blocks):
                 self.warnings.append(
                     "log times lie beyond the year 2262, which no clock shows: they are read as "
@@ -297,6 +310,12 @@ class LogFile(Contents):
         """Return the file, or the part of the write-ahead log, that holds a block."""
         return self._sources[block.part]
 
+    @cached_property
+    def _unfinished(self) -> tuple[str, ...]:
+        """Names of the part files of the session."""
+        local = (path for path in self.parts.paths if not isinstance(path, RemotePath))
+        return tuple(stored_path(path).name for path in local if stored_path(path) != path)
+
     # -- putting together ------------------------------------------------------------------
 
     def _require_channels(self) -> None:
@@ -337,9 +356,12 @@ class LogFile(Contents):
         own = self.metadata.get("undulog", {}).get("session_id")
         if own is None or not ids or own in ids:
             return
+        part = wal.folder.with_suffix(SUFFIX)
+        and_part = f", and {part.name} to NAME.mcap{SUFFIX}" if part.exists() else ""
         self.foreign_wal = (
             f"{wal.folder.name} is the write-ahead log of another session ({min(ids)}) and isn't "
-            f"read; move it to NAME.mcap{wal.folder.suffix}, then 'undulog log recover NAME.mcap'"
+            f"read; move it to NAME.mcap{wal.folder.suffix}{and_part}, then "
+            "'undulog log recover NAME.mcap'"
         )
         self.warnings.append(self.foreign_wal)
 
@@ -360,7 +382,9 @@ class LogFile(Contents):
             return  # the recorder died after everything was written
         accepted = wal.accepted if wal.messages else None
         looked = looked and not wal.damaged
-        self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
+        self.recovered = Recovered(
+            wal.folder, wal.live, in_files, len(rest), accepted, looked, self._unfinished
+        )
         found = list(wal.warnings)
         if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]

@@ -1,7 +1,9 @@
 """The files of a session, from any of its parts or their folder, and the logs in a folder.
 
 The parts of a split session are ``run.mcap``, ``run_0002.mcap``, ``run_0003.mcap``, ... The first
-part has the requested name, whether the session will be split or not.
+part has the requested name, whether the session will be split or not. The marks of a ring are
+sessions of their own: ``run_mark0001.mcap``, ... A file that is not whole yet, or never became so,
+is a part file (``run_0003.mcap.part``), which is read in the place of the final one.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from itertools import count, takewhile
 from pathlib import Path, PurePath
 
 from ...common.errors import InputFileError, LogError, NotALogError, some_names
+from ...common.part_files import SUFFIX, finished_path, is_recorders, stored_path
 from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
@@ -26,8 +29,10 @@ name and hash of the one before), ``next`` (file name of the one after) or, in t
 ``parts`` (their number). A session that was never split has none."""
 
 _NUMBERED = re.compile(r"(.+)_(\d{4,})")
+_MARKED = re.compile(r"(.+)_mark(\d{4,9})", re.DOTALL)
 _FILES = (".mcap", ".db3", ".bag")
 _WAL = ".mcap.wal"
+_UNFINISHED = f".mcap{SUFFIX}"
 
 
 def part_path(first: Path, number: int) -> Path:
@@ -50,8 +55,24 @@ def split_part_path(path: Path) -> tuple[Path, int]:
     return path.with_name(match[1] + path.suffix), int(match[2])
 
 
+def mark_path(output: Path, number: int) -> Path:
+    """Return the file of a ring's mark, e.g. ``run_mark0001.mcap``; marks are numbered from 1."""
+    return output.with_name(f"{output.stem}_mark{number:04d}{output.suffix}")
+
+
+def mark_number(output: Path, path: Path) -> int:
+    """Return the number of a ring's mark; 0 for any other file.
+
+    Args:
+        output: The output that names the marks.
+    """
+    match = _MARKED.fullmatch(path.stem)
+    marks = match is not None and match[1] == output.stem and path.suffix == output.suffix
+    return int(match[2]) if match is not None and marks else 0
+
+
 def later_parts(first: Path) -> list[Path]:
-    """Return the files beside a first part that have the name of a later part, by number.
+    """Return the later parts beside a first part, by number; some may be part files as yet.
 
     Args:
         first: The first part; it need not exist.
@@ -59,7 +80,8 @@ def later_parts(first: Path) -> list[Path]:
     Raises:
         OSError: If the folder can't be listed.
     """
-    names = [(*split_part_path(path), path) for path in first.parent.iterdir()]
+    paths = {_final(path) for path in first.parent.iterdir()}
+    names = [(*split_part_path(path), path) for path in paths]
     return [path for head, number, path in sorted(names) if number > 1 and head == first]
 
 
@@ -98,13 +120,14 @@ def first_part(path: Path) -> Path:
     """Return the first part of a session, which need not exist.
 
     Args:
-        path: Any part, or the folder of one session.
+        path: Any part, its part file, or the folder of one session.
 
     Raises:
         LogError: If a folder holds no session, or several.
     """
     if path.is_dir():
         return _session_in(path)
+    path = path if isinstance(path, RemotePath) else _final(path)
     head, number = split_part_path(path)
     if number == 1:
         return path
@@ -149,7 +172,7 @@ def check_chain(parts: PartFiles) -> Iterator[str]:
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
     paths = {1: first}
     local = not isinstance(first, RemotePath)
-    if local and (part_path(first, 2).exists() or not first.exists()):
+    if local and (stored_path(part_path(first, 2)).exists() or not stored_path(first).exists()):
         paths |= _later(first)
     opened: dict[int, McapFile] = {}
     try:
@@ -179,12 +202,43 @@ def _open_all(
     alone = not bare and len(paths) == 1
     for number, path in reversed(paths.items()):
         try:
-            opened[number] = McapFile(path, bare=not alone)
+            opened[number] = _open(path, bare=not alone)
         except LogError as error:
             if alone:
+                _refuse_ring(path)
                 raise
-            if number > 1 or path.exists():
+            if number > 1 or stored_path(path).exists():
                 missing.insert(0, f"part {number} can't be read: {error}")
+
+
+def _open(path: Path, *, bare: bool) -> McapFile:
+    """Open a part, or the part file that it is as yet."""
+    stored = path if isinstance(path, RemotePath) else stored_path(path)
+    try:
+        return McapFile(stored, bare=bare)
+    except LogError:
+        if stored == path or stored.exists():
+            raise
+        return McapFile(path, bare=bare)  # it has got its final name since
+
+
+def _refuse_ring(path: Path) -> None:
+    """Raise a LogError if a file isn't there because it is the name of a ring, which has marks."""
+    if isinstance(path, RemotePath) or stored_path(path).exists() or not path.parent.is_dir():
+        return
+    try:
+        there = {_final(entry): entry.name for entry in sorted(path.parent.iterdir())}
+    except OSError:  # as the error of the file reports it
+        return
+    if marks := [name for file, name in there.items() if mark_number(path, file)]:
+        listed = some_names(marks, _MOST_LISTED)
+        raise LogError(path, f"is the name of a ring, which has only marks; name one: {listed}")
+
+
+def _final(path: Path) -> Path:
+    """Return the final name of an ``.mcap``'s part file, unless that name is another file's."""
+    final = finished_path(path)
+    return final if path.name.endswith(_UNFINISHED) and not final.exists() else path
 
 
 def _later(first: Path) -> dict[int, Path]:
@@ -261,11 +315,11 @@ def _session_id(file: McapFile) -> str:
 
 def _is_part(path: Path, head: Path) -> bool:
     """Whether a file with the name of a later part is one: by its record, or if it is empty."""
-    known = head.exists() or wal_folder(head).is_dir()
+    known = stored_path(head).exists() or wal_folder(head).is_dir()
     try:
-        file = McapFile(path, bare=True)
+        file = _open(path, bare=True)
     except LogError:
-        return known or not path.exists()
+        return known or not stored_path(path).exists()
     try:
         return PART_RECORD in file.metadata or (known and not file.channels)
     finally:
@@ -280,10 +334,11 @@ def _session_in(folder: Path) -> Path:
         raise LogError(folder, f"can't be listed: {error.strerror}") from error
     heads: dict[Path, None] = {}
     for path in names:
-        if path.suffix == ".mcap" and path.is_file():
+        if (path.suffix == ".mcap" and path.is_file()) or is_recorders(path):
             heads[first_part(path)] = None
         elif path.name.endswith(".mcap.wal") and path.is_dir():
             heads[path.with_name(path.name.removesuffix(".wal"))] = None
+    heads = heads or {first_part(path): None for path in names if path.name.endswith(_UNFINISHED)}
     bag = is_rosbag2(folder)
     if not heads and bag:
         why = "a rosbag2 folder without .mcap; convert it: ros2 bag convert, storage_id: mcap"
@@ -337,8 +392,8 @@ def log_paths(folder: Path, is_recording: Callable[[Path], bool] = is_rosbag2) -
     """Yield the logs in a folder and, behind them, in its folders, each in order of name.
 
     A log is a file ``.mcap``, ``.bag`` or ``.db3``, a rosbag2 folder, whose files are not yielded,
-    or the file that a write-ahead log belongs to, which need not exist and may be yielded twice.
-    Hidden folders are left out.
+    or the file that a recorder's part file or write-ahead log belongs to, which need not exist and
+    may be yielded twice. Hidden folders are left out.
 
     Args:
         is_recording: Whether a folder with a metadata.yaml is one of rosbag2.
@@ -353,5 +408,6 @@ def log_paths(folder: Path, is_recording: Callable[[Path], bool] = is_rosbag2) -
             continue
         logs = [name for name in files if PurePath(name).suffix in _FILES]
         logs += [name.removesuffix(".wal") for name in folders if name.endswith(_WAL)]
+        logs += [finished_path(Path(name)).name for name in files if is_recorders(here / name)]
         yield from (here / name for name in sorted(logs))
         folders[:] = [n for n in folders if not n.startswith(".") and not n.endswith(".wal")]

@@ -31,6 +31,7 @@ from ...common.confined_child import Send
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
 from ...common.extras import is_installed
 from ...common.packets import Packet
+from ...common.part_files import stored_path
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
 from ..file.content import content_id, content_id_of
@@ -228,7 +229,8 @@ def read_bag_facts(path: Path) -> LogFacts:
 
 def is_wal_alone(path: Path) -> bool:
     """Return whether a session's file is missing or empty, and its write-ahead log is there."""
-    is_empty = not path.exists() or (path.is_file() and not path.stat().st_size)
+    stored = stored_path(path)
+    is_empty = not stored.exists() or (stored.is_file() and not stored.stat().st_size)
     return is_empty and wal_folder(path).is_dir()
 
 

@@ -370,19 +370,6 @@ def _call(function: Callable[..., int], address: int, size: int, flag: int) -> N
         raise OSError(code, os.strerror(code))
 
 
-def sync_folder(folder: Path) -> None:
-    """Write a folder's entries to the disk, so that a new file's name survives power loss.
-
-    Raises:
-        OSError: If the disk fails.
-    """
-    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)
-
-
 def _shortage(needed: int, free: int) -> str:
     return (
         f"needs {needed} bytes and the disk has {free} free: {needed - free} bytes are missing; "

@@ -42,6 +42,7 @@ from typing import Self
 from mcap.opcode import Opcode
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError
+from ...common.part_files import sync_folder
 from ..mcap.batch import MessageFields
 from .format import (
     DEFINITIONS,
@@ -56,7 +57,7 @@ from .format import (
     segment_files,
     segment_name,
 )
-from .segment import SEGMENT_OVERHEAD, Segment, sync_folder
+from .segment import SEGMENT_OVERHEAD, Segment
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS_SIZE = 1 << 18

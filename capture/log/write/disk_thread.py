@@ -14,9 +14,10 @@ from queue import SimpleQueue
 from mcap.records import Metadata
 
 from ...common.errors import LogWriteError, OutputExistsError
+from ...common.part_files import NEW_FILE, publish, sync_folder, unfinished_path
 from ..file.parts import PART_RECORD
 from ..mcap.writer import McapWriter
-from ..wal.segment import FULL, ReservedSpace, sync_folder
+from ..wal.segment import FULL, ReservedSpace
 from ..wal.writer import WriteAheadLog
 from .mcap_sink import write_description, write_error
 
@@ -25,10 +26,17 @@ class FileDeletedError(LogWriteError):
     """The file that is being written was deleted."""
 
 
+class NameTakenError(LogWriteError):
+    """Another program took the final name of the file that is being written."""
+
+
 class PartStream:
     """A file that is written later, so that the MCAP writer never waits for the disk.
 
+    It is a part file until it is whole.
+
     Attributes:
+        path: Its final name.
         number: The part, from 1.
         size: Bytes of the part so far, written or not.
     """
@@ -47,15 +55,22 @@ class PartStream:
         self.path = path
         self.number = number
         self.size = 0
+        self._unfinished = unfinished_path(path)
+        self._force = force
         self._pieces: list[bytes] = []
         self._hash = hashlib.sha256()
         self._named = False
         try:
             if force:
-                path.unlink(missing_ok=True)
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+                for earlier in (path, self._unfinished):
+                    earlier.unlink(missing_ok=True)
+            elif path.exists():
+                raise OutputExistsError(path)
+            self._file = os.open(self._unfinished, os.O_WRONLY | NEW_FILE, 0o666)
         except FileExistsError as error:
-            raise OutputExistsError(path) from error
+            if isinstance(error, OutputExistsError):
+                raise
+            raise OutputExistsError(self._unfinished) from error
         except OSError as error:
             raise write_error(path, error) from error
 
@@ -110,6 +125,21 @@ class PartStream:
             if os.fstat(self._file).st_nlink == 0:
                 raise FileDeletedError(self.path, "was deleted while it was being written")
 
+    def publish(self) -> None:
+        """Give the file its final name, after the last sync.
+
+        Raises:
+            NameTakenError: If there is a file of that name meanwhile.
+            OSError: If the disk fails.
+        """
+        try:
+            publish(self._unfinished, self.path, replace=self._force)
+        except FileExistsError as error:
+            raise NameTakenError(
+                self.path,
+                f"another program made a file of this name; all is in {self._unfinished.name}",
+            ) from error
+
     def close(self) -> str:
         """Close the file and return the SHA-256 of its contents."""
         with suppress(OSError):  # it was synced before; an error of close comes too late
@@ -120,7 +150,7 @@ class PartStream:
         """Close and delete the file."""
         self.close()
         with suppress(OSError):
-            self.path.unlink()
+            self._unfinished.unlink()
 
 
 _PATIENCE_S = 2.0  # file systems free deleted space with a delay
@@ -262,7 +292,10 @@ class DiskThread:
             self._ends += sum(map(len, pieces))
             self._put(part, pieces)
             self._covered = max(self._covered, item.covered)
-            self._sync(part)
+            part.sync()
+            part.publish()
+            self._unsynced = 0
+            self._wal.release(self._covered)
         except OSError as error:
             self._failure = write_error(part.path, error)
             part.close()

@@ -14,12 +14,13 @@ from pathlib import Path
 from mcap.records import Header, Metadata
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError, UndulogError
+from ...common.part_files import unfinished_path
 from ..file.parts import PART_RECORD, later_parts, part_path
 from ..mcap.batch import MessageBatch
 from ..mcap.writer import McapWriter
 from ..wal.segment import ReservedSpace
 from ..wal.writer import WriteAheadLog, wal_folder
-from .disk_thread import DiskThread, FileDeletedError, PartStream
+from .disk_thread import DiskThread, FileDeletedError, NameTakenError, PartStream
 from .mcap_sink import (
     PROFILE,
     Description,
@@ -323,6 +324,12 @@ class DurableSink:
             raise FileDeletedError(
                 trouble.path, f"{_reason(trouble)}; only what {self._wal.folder} still has is left"
             ) from trouble
+        if isinstance(trouble, NameTakenError):
+            raise NameTakenError(
+                trouble.path,
+                f"{_reason(trouble)} and {self._wal.folder.name}: rename the other file, then "
+                f"'undulog log recover {self.path}'",
+            ) from trouble
         if trouble is not None:
             raise LogWriteError(
                 trouble.path,
@@ -392,6 +399,8 @@ def _refuse_existing(path: Path) -> None:
     """Refuse a session that has a file already."""
     if path.exists():
         raise OutputExistsError(path)
+    if unfinished_path(path).exists():
+        raise OutputExistsError(unfinished_path(path))
     try:
         later = later_parts(path)
     except OSError as error:

@@ -1,15 +1,14 @@
 """The last seconds of a recording, kept in memory and written to a file on request.
 
 This is for rare events: the robot runs for hours, and a mark stores the seconds before it.
-Each mark is a complete session file; the latched state before its first message (``/gait/mode``,
-``/robot_description``) is copied to its start, as ``undulog log cut --carry-state`` does.
+Each mark is a complete session file, and a part file until it is whole; the latched state before
+its first message (``/gait/mode``, ``/robot_description``) is copied to its start, as ``undulog log
+cut --carry-state`` does.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -22,9 +21,10 @@ from mcap.records import Channel, Metadata, Schema
 
 from ...common.amounts import format_size
 from ...common.errors import LogWriteError, UndulogError
+from ...common.part_files import finished_path, publish_durably, unfinished_path
+from ..file.parts import mark_number, mark_path
 from ..mcap.batch import MessageBatch, MessageFields
 from ..messages.definitions import adds_up, is_latched
-from ..wal.segment import sync_folder
 from .mcap_sink import Description, McapSink, MessageSink, write_error
 
 MARK_RECORD = "undulog.mark"
@@ -87,8 +87,8 @@ class RingSink:
             path: Names the marks: ``run.mcap`` gives ``run_mark0001.mcap`` and so on, after those
                 that are there already.
             duration_ns: How much to keep, in log time [ns].
-            open_file: Creates a file for a mark and must refuse one that exists; called in the
-                thread that writes.
+            open_file: Creates the part file of a mark and must refuse one that exists; called in
+                the thread that writes.
             max_bytes: The oldest messages go when more than this is held [B].
         """
         self._path, self._duration_ns, self._max_bytes = path, duration_ns, max_bytes
@@ -249,8 +249,8 @@ class RingSink:
     def _next_path(self) -> Path:
         while True:
             self._number += 1
-            name = f"{self._path.stem}_mark{self._number:04d}{self._path.suffix}"
-            if not (path := self._path.with_name(name)).exists():
+            path = mark_path(self._path, self._number)
+            if not (path.exists() or unfinished_path(path).exists()):
                 return path
 
 
@@ -262,8 +262,9 @@ def _write_mark(
     messages: Sequence[RingMessage],
 ) -> Mark:
     error: LogWriteError | None = None
+    part = unfinished_path(path)
     try:
-        sink = open_file(path)
+        sink = open_file(part)
         try:
             for record in definitions:
                 sink.define(record)
@@ -273,9 +274,7 @@ def _write_mark(
                     time.sleep(0)  # or the recorder's thread waits for a whole switch interval
         finally:
             sink.close(())
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        sync_folder(path.parent)
+        publish_durably(part, path, replace=False)
     except OSError as failure:
         error = write_error(path, failure)
     except UndulogError as failure:
@@ -292,12 +291,11 @@ def _write_mark(
 
 def _last_number(path: Path) -> int:
     """Return the highest number of an existing mark."""
-    pattern = re.compile(rf"{re.escape(path.stem)}_mark(\d{{4,9}}){re.escape(path.suffix)}")
     try:
-        names = [entry.name for entry in path.parent.iterdir()]
+        names = [finished_path(entry) for entry in path.parent.iterdir()]
     except OSError:  # the folder may not exist: the first mark reports it
         return 0
-    return max((int(found[1]) for found in map(pattern.fullmatch, names) if found), default=0)
+    return max((mark_number(path, name) for name in names), default=0)
 
 
 class RingStorage:

@@ -154,7 +154,7 @@ def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):
 def test_a_file_that_somebody_deletes_is_reported_before_the_end(tmp_path):
     sink = recorder.open_sink(tmp_path / "run.mcap", flush_interval_s=0.01)
     recorder.write(sink, 0)
-    (tmp_path / "run.mcap").unlink()
+    (tmp_path / "run.mcap.part").unlink()
 
     def go_on():
         for number in itertools.count(1):

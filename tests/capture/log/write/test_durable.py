@@ -17,6 +17,7 @@ from support.processes import python, wait_for
 from support.read_back import messages_of, metadata_of, read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
+from undulog.capture.common.part_files import unfinished_path
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.batch import MessageBatch
 from undulog.capture.log.mcap.chunk import BODY_AT
@@ -101,14 +102,15 @@ def test_a_quiet_session_reaches_the_file_by_itself(tmp_path):
     path = tmp_path / "run.mcap"
     sink = recorder.open_sink(path, flush_interval_s=0.01)
     recorder.write(sink, 0)
-    empty = path.stat().st_size
+    part = unfinished_path(path)
+    empty = part.stat().st_size
 
     def grown():
         sink.tick()
-        return path.stat().st_size > empty + 100 and sink.backlog == 0
+        return part.stat().st_size > empty + 100 and sink.backlog == 0
 
     wait_for(grown, "the chunk in the file")
-    shutil.copy(path, tmp_path / "copy.mcap")  # without the write-ahead log
+    shutil.copy(part, tmp_path / "copy.mcap")  # without the write-ahead log
     with Session(tmp_path / "copy.mcap") as session:
         assert session.channels["/a"].count == 1
     sink.close(())
@@ -296,7 +298,7 @@ def test_a_failing_disk_ends_the_recording_and_loses_nothing(tmp_path, monkeypat
     real = os.write
 
     def broken(file, data):
-        if Path(f"/proc/self/fd/{file}").readlink() == path:
+        if Path(f"/proc/self/fd/{file}").readlink() == unfinished_path(path):
             raise OSError(5, "Input/output error")
         return real(file, data)
 

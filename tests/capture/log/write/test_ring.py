@@ -179,17 +179,18 @@ def test_nothing_is_overwritten_and_numbers_go_on(tmp_path):
     assert (tmp_path / "run_mark0008.mcap").read_bytes() == b"came later"
 
 
-def test_a_file_that_comes_in_between_is_not_overwritten_either(tmp_path):
+@pytest.mark.parametrize("name", ["run_mark0001.mcap", "run_mark0001.mcap.part"])
+def test_a_file_that_comes_in_between_is_not_overwritten_either(name, tmp_path):
     def late(path):
-        path.write_bytes(b"precious")
+        (tmp_path / name).write_bytes(b"precious")
         return McapSink(path)
 
     ring = defined(RingSink(tmp_path / "run.mcap", SECOND, open_file=late))
     ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"x")
-    path = ring.mark()
+    ring.mark()
     (mark,) = written(ring)
-    assert "exists already" in str(mark.error)
-    assert path.read_bytes() == b"precious"
+    assert "exists" in str(mark.error)
+    assert (tmp_path / name).read_bytes() == b"precious"
     ring.close(())
 
 
@@ -227,7 +228,10 @@ def test_a_full_disk_is_reported_and_what_fits_stays(disk_of):
     ring.mark()
     (mark,) = written(ring)
     assert "No space left" in str(mark.error)
-    assert mark.path.stat().st_size > 0
+    assert not mark.path.exists()  # what fits is in the part file
+    with Session(mark.path) as session:
+        assert 0 < session.channels["/a"].count < 1000
+        assert any("run_mark0001.mcap.part has not got" in text for text in session.warnings)
     ring.close(())
     with pytest.raises(LogWriteError, match="closed"):
         put(ring, (0, b"x"))
@@ -352,3 +356,54 @@ def test_a_recording_kept_in_a_ring_reports_its_marks(tmp_path):
     assert storage.files() == (path,)
     assert (storage.messages, storage.unsynced) == (4, 2)
     ring.close(())
+
+
+# -- a recorder that is killed while it writes a mark ----------------------------------------------
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from undulog.capture.log.write import ring_sink
+from undulog.capture.log.write.mcap_sink import McapSink
+from undulog.capture.log.write.writer import SessionWriter
+
+class Dying(McapSink):
+    left = int(sys.argv[2])
+
+    def write(self, *message):
+        super().write(*message)
+        Dying.left -= 1
+        if not Dying.left:
+            self._stream.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+path = Path(sys.argv[1])
+ring = ring_sink.RingSink(path, 10**12, open_file=Dying)
+writer = SessionWriter(path, session_id="s", epoch_ns=1, sink=ring)
+texts = writer.string("/text")
+for k in range(4000):
+    texts.write(10**9 + k, f"{k} " + os.urandom(400).hex())
+ring.mark()
+ring.close(())
+"""
+
+
+def test_a_mark_that_a_kill_interrupts_has_no_final_name_and_is_recovered(tmp_path, command):
+    died = python(KILLED, tmp_path / "run.mcap", 3500)
+    assert died.returncode == -9, died
+    name = "run_mark0001.mcap.part"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    for place in (tmp_path, tmp_path / "run_mark0001.mcap", tmp_path / name):
+        assert f"{name} has not got its final name" in command("log", "info", place).out
+    ring = command("log", "info", tmp_path / "run.mcap", code=1).err
+    assert f"is the name of a ring, which has only marks; name one: {name}" in ring
+    shutil.copy(tmp_path / name, tmp_path / "other_mark0001.mcap.part")
+    table = command("log", "info", tmp_path).out
+    for each in (name, "other_mark0001.mcap.part"):
+        assert f"{each} has not got its final name" in table
+    command("log", "recover", tmp_path / "run_mark0001.mcap")
+    found = messages_of(tmp_path / "run_mark0001.recovered.mcap")
+    assert [message.sequence for *_, message in found] == list(range(len(found)))
+    assert 1000 < len(found) <= 3500  # the chunks that were whole
+    ring = RingSink(tmp_path / "run.mcap", SECOND)  # numbers go on after it
+    assert marked(ring).name == "run_mark0002.mcap"
