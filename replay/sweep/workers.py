@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from functools import partial
 from typing import Any, Self
 
 from undulog.capture.common.console import complain
@@ -30,6 +31,8 @@ _COUNT_S = 2.0
 PATIENCE_S = 300.0
 """How long a scheduler that ended or doesn't answer, or a first worker, is waited for [s]."""
 
+_CONNECT_S = 60.0
+"""How long a client may take to start [s]: Dask's own limit of 5 s is that of its connection."""
 _CANCEL_S = 10.0
 """How long a scheduler may take to cancel runs, when an end is requested [s]."""
 _ATTEMPTS = 3
@@ -232,12 +235,12 @@ def _answer(
     call: Callable[[], Any],
     address: str,
     look: Callable[[], None] = lambda: None,
-    limit_s: float = PATIENCE_S,
+    limit_s: float | None = None,
 ) -> Any:
     """Return what a scheduler answers; Dask waits for it without a limit."""
     advice = "it is frozen or out of reach; rows that are done are kept, so start the sweep again"
     what = f"{address}: the Dask scheduler"
-    return attended(call, what, advice, limit_s=limit_s, look=look)
+    return attended(call, what, advice, limit_s=limit_s or PATIENCE_S, look=look)
 
 
 class _StoppedError(Exception):
@@ -274,7 +277,8 @@ def _connected(address: str, stop: StopRequest, patience_s: float) -> Any:
     deadline = time.monotonic() + patience_s
     while True:
         try:
-            return Client(address, timeout=5, set_as_default=False)
+            connect = partial(Client, address, timeout=5, set_as_default=False)
+            return _answer(connect, address, limit_s=_CONNECT_S)
         except (OSError, TimeoutError, ValueError) as error:
             if time.monotonic() > deadline or stop.requested:
                 raise SourceError(address, f"no Dask scheduler answers: {error}") from error
