@@ -119,9 +119,8 @@ class Recovery(Iterator[WalMessage]):
         try:
             files = segment_files(self.folder)
         except OSError as error:
-            raise LogError(
-                self.folder, f"no write-ahead log can be read here: {error.strerror}"
-            ) from error
+            fault = f"no write-ahead log can be read here: {error.strerror}"
+            raise LogError(self.folder, fault) from error
         if not files:
             raise NotALogError(self.folder, "no segment of a write-ahead log is in this folder")
         found: list[_Found] = []
