@@ -8,6 +8,7 @@ file's data. Memory is bounded: data older than a minute are summed up.
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -17,7 +18,7 @@ from mcap.records import Channel, Schema
 
 from ..common.arrays import NS
 from ..common.errors import DataError
-from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
+from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT, WAITS_FOR_COMMANDS
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
 from ..log.health.tallies import BusHealth, JointHealth, Timing
 from ..log.mcap.batch import MessageBatch, MessageFields
@@ -198,6 +199,19 @@ class LiveHealth:
             end_ns = min(self._unmeasured.values(), default=end_ns)
             self._latest = self._scan.result(start_ns, end_ns, measured=self._measured)
         return self._latest
+
+    def standing(self, sources: Sequence[Source]) -> tuple[str, str, tuple[str, ...]]:
+        """Return state, verdict and reasons so far.
+
+        A robot whose servos only answer is silent until its controller asks: while every source is
+        connected and has given no frame, that is no fault. At the end it is.
+        """
+        measures = self.result()
+        silent = all(source.connected and not source.counts.frames for source in sources)
+        if self._scan.commanded and silent:
+            return WAITS_FOR_COMMANDS, "good", ()
+        state = WAITS_FOR_COMMANDS if measures.waits else "recording"
+        return state, measures.verdict, measures.reasons
 
     def final(self) -> SessionMeasures:
         """Return the verdict on all messages, which is stored when the session is closed.

@@ -298,12 +298,13 @@ class Recording:
         self._sizes.append((now_ns, self._storage.size))
         (began, had), (ended, has) = self._sizes[0], self._sizes[-1]
         measures, times = self._health.result(), self._recorder.ticks.result()
+        state, verdict, reasons = self._health.standing(self._sources)
         clocks = self._recorder.clocks
         self._snapshot = RecorderSnapshot(
             session_id=self._session_id,
             path=str(self._storage.part_path),
             robot=self._robot.name if self._robot is not None else None,
-            state="recording",
+            state=state,
             now_ns=now_ns,
             elapsed_s=(now_ns - self._clock.epoch_ns) / NS,
             messages=self._storage.messages,
@@ -311,8 +312,8 @@ class Recording:
             byte_rate=(has - had) * NS / (ended - began) if ended > began else None,
             free=free_space(self._settings.output),
             part=self._storage.part,
-            verdict=measures.verdict,
-            reasons=measures.reasons,
+            verdict=verdict,
+            reasons=reasons,
             notes=measures.notes,
             sources=tuple(
                 self._health.source(source, text, clocks.get(source.name))

@@ -24,7 +24,7 @@ from rich.text import Text
 from ..common.amounts import format_size
 from ..common.arrays import NS
 from ..common.console import Cells, Column, cut, fit, plain, table
-from ..log.health.rules import has_rhythm
+from ..log.health.rules import WAITS_FOR_COMMANDS, has_rhythm
 from ..log.messages.definitions import ERROR, OK
 from .status import (
     EventLine,
@@ -105,7 +105,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
 def plain_line(snapshot: RecorderSnapshot) -> str:
     """Return time, verdict, size, sources and heaviest reason in one line."""
     parts = [
-        f"{clock_time(snapshot.elapsed_s)} {snapshot.verdict}",
+        f"{clock_time(snapshot.elapsed_s)} {snapshot.verdict}{_waiting(snapshot)}",
         f"{snapshot.messages:,} messages, {format_size(snapshot.size)}",
     ]
     for source in snapshot.sources:
@@ -118,6 +118,10 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
         more = len(snapshot.reasons) - 1
         parts.append(snapshot.reasons[0] + (f" (and {more} more)" if more else ""))
     return plain("; ".join(parts))
+
+
+def _waiting(snapshot: RecorderSnapshot) -> str:
+    return f", {snapshot.state}" if snapshot.state == WAITS_FOR_COMMANDS else ""
 
 
 def event_line(event: EventLine) -> str:
@@ -149,7 +153,7 @@ def time_left(time_s: float) -> str:
 
 
 def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
-    what = f"{snapshot.state} {_shorter(snapshot.path, width - 30)}"
+    what = f"{snapshot.state} {_shorter(snapshot.path, width - 21 - len(snapshot.state))}"
     robot = f"  {snapshot.robot}" if snapshot.robot else ""
     time = clock_time(snapshot.elapsed_s)
     first = Text(no_wrap=True)
@@ -177,6 +181,7 @@ def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     line.append(f" {snapshot.verdict.upper()} ", STYLES[snapshot.verdict])
     count = len(snapshot.reasons)
     why = "nothing found so far" if not count else f"so far, {count} reason{'s' * (count != 1)}"
+    why += _waiting(snapshot)
     late = ""
     if snapshot.tick_p99_s is not None:
         late = f" | tick p99 {snapshot.tick_p99_s * 1e3:.1f} ms"

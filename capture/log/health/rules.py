@@ -64,6 +64,9 @@ BAD_JOINTS = 0.5
 
 _MOST_LISTED = 8
 
+WAITS_FOR_COMMANDS = "waiting for commands"
+"""State of a session of a robot that reports its joints and has had no command yet."""
+
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
@@ -86,6 +89,10 @@ class Finding:
 
     weight: int
     sentence: str
+
+
+WAITING = Finding(0, f"{WAITS_FOR_COMMANDS}: the robot reports its joints, and none has come")
+"""A fact about the controller and no fault of the record."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +230,15 @@ def has_rhythm(topic: str) -> bool:
     return topic not in (*VIEW_AIDS, *OFFSET_TOPICS) and not topic.startswith(RECORDER_TOPICS)
 
 
-def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[Fault]:
+def judge_series(
+    health: SeriesHealth, start_ns: int, end_ns: int, commands_ns: int | None = None
+) -> Iterator[Fault]:
     """Yield what is wrong with the rhythm of one series.
 
     Args:
         start_ns: Log time of the session's first message [Unix ns].
         end_ns: Log time of its last message [Unix ns].
+        commands_ns: Log time of its first command [Unix ns]; None without commands.
 
     Yields:
         The faults; none for view aids and for the recorder's own topics.
@@ -246,8 +256,8 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[F
         text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
         yield Fault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
     if timing.regular:
-        texts = _edges_and_jitter(health, start_ns, end_ns)
-        yield from (Fault(1, label, "", text) for text in texts)
+        found = _edges_and_jitter(health, start_ns, end_ns, commands_ns)
+        yield from (Fault(weight, label, "", text) for weight, text in found)
     elif joints and timing.count > FROZEN_SAMPLES:
         yield Fault(0, label, "", "no steady rate, so single gaps can't be found")
     if timing.backward:
@@ -295,17 +305,24 @@ def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[F
         )
 
 
-def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:
-    """Describe faults of the start, the end and the intervals of a regular series."""
+def _edges_and_jitter(
+    health: SeriesHealth, start_ns: int, end_ns: int, commands_ns: int | None
+) -> Iterator[tuple[int, str]]:
+    """Describe faults of the start, the end and the intervals of a regular series.
+
+    A series that starts with the first command waited for it, as a robot may; that is no fault.
+    """
     timing, median_s = health.timing, health.timing.median_s or 0.0
     edge_s = max(PAUSE_S, PAUSE_PERIODS * median_s)
     late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
     if late_s > edge_s:
-        yield f"starts {late_s:.3g} s after the session"
+        waited = commands_ns is not None and health.first_log_ns - commands_ns <= edge_s * NS
+        text = f"starts {late_s:.3g} s after the session"
+        yield (0, f"{text}, with the first command") if waited else (1, text)
     if early_s > edge_s:
-        yield f"ends {early_s:.3g} s before the session"
+        yield 1, f"ends {early_s:.3g} s before the session"
     if timing.std_s is not None and timing.std_s > MAX_JITTER * median_s:
-        yield f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
+        yield 1, f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
 
 
 def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[Fault]:
@@ -391,6 +408,8 @@ def judge_topics(
     joints: Sequence[str],
     seen: Iterable[str],
     undecoded: str | None = None,
+    *,
+    commanded: bool = False,
 ) -> Iterator[Finding]:
     """Yield findings on topics of joints that the session lacks.
 
@@ -401,6 +420,8 @@ def judge_topics(
         seen: Joints that the topic of responses carries.
         undecoded: Why almost no raw CAN frame could be decoded, which then is the only reason for
             missing topics; None otherwise.
+        commanded: Whether the robot's bus map defines commands: then the frames show that none has
+            come, and the session waits for the first.
     """
     if undecoded is not None:
         yield Finding(1, undecoded)
@@ -409,6 +430,9 @@ def judge_topics(
     commands, responses = topics
     for topic in dict.fromkeys((responses, commands)):
         if topic in types:
+            continue
+        if topic == commands and framed and commanded and responses in types and not undecoded:
+            yield WAITING
             continue
         if others:
             sentence = f"{topic} is missing; joints are on {', '.join(others)}"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import NS, IntArray
-from ...robot.model import Robot
+from ...robot.model import Quantity, Robot
 from ..mcap.chunk import Buffer
 from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.definitions import JOINT_STATE, MessageType
@@ -23,6 +23,7 @@ from .bus_tally import SourceHealth, judge_source, measure_sources, named_identi
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
 from .rules import (
+    WAITING,
     Finding,
     joined,
     judge_body,
@@ -73,6 +74,11 @@ class SessionMeasures:
     def verdict(self) -> str:
         """``good``, ``degraded`` or ``bad``."""
         return verdict_of(self.findings)
+
+    @property
+    def waits(self) -> bool:
+        """Whether the robot reports its joints and no command has come yet."""
+        return WAITING in self.findings
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -211,13 +217,16 @@ class SessionScan:
         seen = [joint.name for joint in joints if joint.topic == self._states]
         unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
         why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
-        findings = [*before, *judge_topics(types, self._angles, chain, seen, why)]
+        topics = judge_topics(types, self._angles, chain, seen, why, commanded=self.commanded)
+        findings = [*before, *topics]
         faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
+        first = [each.first_log_ns for each in series if each.topic == self._commands]
+        commands_ns = min(first, default=None)
         for each in series:
             if each.topic not in framed:
-                faults += judge_series(each, start_ns, end_ns)
+                faults += judge_series(each, start_ns, end_ns, commands_ns)
         findings += joined([*faults, *judge_joints(joints, start_ns)])
         findings += judge_body([joint for joint in joints if joint.topic == self._states])
         for bus in buses:
@@ -237,6 +246,12 @@ class SessionScan:
             buses=buses,
             sources=sources,
         )
+
+    @cached_property
+    def commanded(self) -> bool:
+        """Whether the robot's bus map defines commands."""
+        bus = None if self._robot is None else self._robot.bus
+        return bus is not None and any(s.quantity is Quantity.COMMAND for s in bus.signals)
 
     @cached_property
     def _named(self) -> frozenset[int]:

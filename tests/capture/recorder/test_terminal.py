@@ -272,6 +272,15 @@ def test_a_terminal_that_has_gone_is_no_trouble():
     assert text.getvalue() == ""
 
 
+def test_a_recording_that_waits_for_commands_is_shown_as_such():
+    waiting = replace(SNAPSHOT, state="waiting for commands", verdict="good", reasons=())
+    shown = screen(waiting, 80).plain.splitlines()
+    assert shown[0].startswith("waiting for commands /data/run.mcap  snake25")
+    assert shown[2].startswith(" GOOD  nothing found so far, waiting for commands")
+    assert plain_line(waiting).startswith("0:12:34 good, waiting for commands; ")
+    assert "waiting" not in screen(SNAPSHOT, 80).plain + plain_line(SNAPSHOT)
+
+
 def test_the_line_says_what_matters():
     line = plain_line(SNAPSHOT)
     assert line.startswith("0:12:34 degraded; 1,234,567 messages, 123 MB; can0 connected, lost 12")
