@@ -21,7 +21,7 @@ from ..common.files import write_text
 if TYPE_CHECKING:
     from ..common.process import StopRequest
     from ..recorder.control_client import ControlClient
-    from ..recorder.recording import RecordReport
+    from ..recorder.record_report import RecordReport
     from ..recorder.settings import RecordSettings
     from ..recorder.status import RecorderSnapshot
     from ..recorder.systemd import Notifier

@@ -15,7 +15,8 @@ import fcntl
 import os
 import re
 import stat
-from collections.abc import Generator
+import tempfile
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -27,8 +28,8 @@ NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 _SESSION = ".mcap"
 _WAL = ".wal"
-_NUMBERED = re.compile(r".+_(mark)?\d{4,}", re.DOTALL)
-"""Stems that a recorder gives to later parts and to marks."""
+_NUMBERED = re.compile(r".+(_(mark)?\d{4,}|\.rescued-[0-9a-f]{8})", re.DOTALL)
+"""Stems that a recorder gives to later parts, to marks and to rescue files."""
 
 _TRIES = 8
 """Names that are tried; all but the first are random."""
@@ -74,6 +75,45 @@ def recording_left(output: Path) -> Path | None:
     if not is_recorders(part):
         return None
     return part if part.exists() else wal if wal.is_dir() else None
+
+
+def present_path(opened: int, path: Path) -> Path | None:
+    """Return where an open file is now; None if no name leads to it any more.
+
+    Args:
+        opened: Its descriptor.
+        path: Where it was made, which is asked first.
+    """
+    facts = os.fstat(opened)
+    with suppress(OSError):
+        if os.path.samestat(path.lstat(), facts):
+            return path
+    with suppress(OSError):  # without /proc only its own place is looked at
+        now = Path(os.readlink(f"/proc/self/fd/{opened}"))  # noqa: PTH115 - as it is
+        if os.path.samestat(now.lstat(), facts):
+            return now
+    return None
+
+
+def remove_opened(opened: int, path: Path) -> None:
+    """Remove an open file where it is now, and no other that has its name."""
+    where = present_path(opened, path)
+    if where is not None:
+        with suppress(OSError):  # another program may have removed it
+            where.unlink()
+
+
+def rescue_folders(folder: Path) -> Iterator[Path]:
+    """Yield where a rescue file may go if a folder is lost: above it, then the temporary files.
+
+    Args:
+        folder: Its absolute path.
+    """
+    above = next((parent for parent in folder.parents if parent.is_dir()), None)
+    if above is not None:
+        yield above
+    with suppress(OSError):  # there is none that can be written
+        yield Path(tempfile.gettempdir())
 
 
 def sync_folder(folder: Path) -> None:

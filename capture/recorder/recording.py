@@ -5,13 +5,10 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-import shutil
 import uuid
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mcap.records import Metadata
@@ -29,72 +26,16 @@ from .bus_recorder import decoded_source, robot_of
 from .control import ControlServer
 from .control_client import default_sockets
 from .control_requests import RequestHandler
+from .free_space import FreeSpace
 from .health import LiveHealth
 from .links import SourceLink, link_faults
 from .live_feed import LiveFeed
 from .loop import Ending, Recorder
+from .record_report import RecordReport
 from .screen import plain_line
 from .settings import RecordSettings
 from .status import EventLine, RecorderSnapshot, SessionClock, statuses
 from .systemd import Notifier
-
-
-def free_space(path: Path) -> int:
-    """Return the free bytes [B] of the disk of a file, which need not exist yet.
-
-    Raises:
-        LogWriteError: If its folder can't be used.
-    """
-    try:
-        return shutil.disk_usage(path.parent).free
-    except OSError as error:
-        raise LogWriteError(
-            path, f"its folder can't be used: {os.strerror(error.errno or 0)}"
-        ) from error
-
-
-@dataclass(frozen=True)
-class RecordReport:
-    """Summary of a recording.
-
-    Attributes:
-        files: The session's files, in order.
-        robot: Name of the robot, or None.
-        verdict: ``good``, ``degraded`` or ``bad``.
-        reasons: Reasons for a verdict that is not good.
-        sources: Frame counts by name of the source.
-        recorder: Facts about the recorder itself: ticks and so on.
-    """
-
-    files: tuple[Path, ...]
-    session_id: str
-    robot: str | None
-    duration_s: float
-    messages: int
-    size: int
-    verdict: str
-    reasons: tuple[str, ...]
-    ending: Ending
-    sources: Mapping[str, Mapping[str, Any]]
-    recorder: Mapping[str, Any]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain JSON."""
-        return {
-            "files": [str(file) for file in self.files],
-            "session_id": self.session_id,
-            "robot": self.robot,
-            "duration_s": self.duration_s,
-            "messages": self.messages,
-            "size_bytes": self.size,
-            "verdict": self.verdict,
-            "reasons": list(self.reasons),
-            "ended": self.ending.reason,
-            "failed": self.ending.failed,
-            "sources": {name: dict(facts) for name, facts in self.sources.items()},
-            "recorder": dict(self.recorder),
-        }
-
 
 _EVENTS_SHOWN = 8
 _VIEW, _HEALTH = "live view", "live health"
@@ -165,13 +106,7 @@ class Recording:
         decoded = decoded_source(settings, self._sources, robot)
         if settings.fast and any(source.robot is None for source in self._sources):
             raise UsageError("--fast is for a twin alone; a bus has its own time")
-        free = free_space(settings.output)
-        if free < settings.floor:
-            raise LogWriteError(
-                settings.output,
-                f"only {free / 1e6:.0f} MB are free there, less than the floor of "
-                f"{settings.floor / 1e6:.0f} MB (--floor)",
-            )
+        self._free = FreeSpace(settings.output)
         self._clock = SessionClock()
         self._session_id = uuid.uuid4().hex
         self._health = LiveHealth(robot)
@@ -179,6 +114,8 @@ class Recording:
         self._sizes: deque[tuple[int, int]] = deque(maxlen=_RATE_UPDATES)
         self._snapshot: RecorderSnapshot | None = None
         with ExitStack() as opened:  # closes in turn if a later step fails
+            opened.callback(self._free.close)
+            self._require_free()
             self._control = _control_of(settings)  # first: two recorders never share one
             opened.callback(self._control.close)
             self._feed = LiveFeed(self._control.path.with_suffix(".live"))
@@ -218,6 +155,15 @@ class Recording:
             _HEALTH: lambda: self._health.step(self._clock.now_ns()),
         }
 
+    def _require_free(self) -> None:
+        free = self._free()
+        if free < self._settings.floor:
+            raise LogWriteError(
+                self._settings.output,
+                f"only {free / 1e6:.0f} MB are free there, less than the floor of "
+                f"{self._settings.floor / 1e6:.0f} MB (--floor)",
+            )
+
     def warn(self, name: str, text: str) -> None:
         """Write a warning to ``/rosout``."""
         self._recorder.log_event("warn", name, text)
@@ -245,6 +191,7 @@ class Recording:
             self._feed.close()
             report = self._report(ending)
             self._control.close(report.as_json())
+            self._free.close()
             if useless:  # nothing was recorded: the name is free for another try
                 for file in report.files:
                     file.unlink(missing_ok=True)
@@ -310,7 +257,7 @@ class Recording:
             messages=self._storage.messages,
             size=self._storage.size,
             byte_rate=(has - had) * NS / (ended - began) if ended > began else None,
-            free=free_space(self._settings.output),
+            free=self._free(),
             part=self._storage.part,
             verdict=verdict,
             reasons=reasons,
@@ -341,10 +288,14 @@ class Recording:
             self._show(self._snapshot)
 
     def _check_disk(self) -> None:
+        if (reason := self._storage.must_end) and self._recorder.ending is None:
+            self._recorder.ending = Ending(reason, failed=True)
+        if self._recorder.ending is not None:
+            return
         if self._storage.shortage is not None:
             raise self._storage.shortage
-        free = free_space(self._settings.output)
-        if free < self._settings.floor and self._recorder.ending is None:
+        free = self._free()
+        if free < self._settings.floor:
             self._recorder.ending = Ending(
                 f"only {free / 1e6:.0f} MB are left on the disk, less than the floor of "
                 f"{self._settings.floor / 1e6:.0f} MB; nothing later is recorded",
@@ -391,7 +342,23 @@ class Recording:
                 full = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
                 text = full if ending.failed else str(error)
                 ending = dataclasses.replace(ending, reason=text, failed=True)
-        return ending
+        return self._with_places(ending)
+
+    def _with_places(self, ending: Ending) -> Ending:
+        """Add to the reason where the session is, if it was deleted or moved meanwhile."""
+        if not self._storage.must_end:
+            return ending
+        files = self._storage.files()
+        there = [str(file) for file in files if file.exists()]
+        gone = [file.name for file in files if not file.exists()]
+        texts = [self._storage.must_end] if self._storage.must_end not in ending.reason else []
+        texts.append(ending.reason)
+        if there:
+            what = "all that was accepted" if not gone else "what was accepted since"
+            texts.append(f"{what} is in {', '.join(there)}")
+        if gone and there:
+            texts.append(f"{', '.join(gone)} went with the folder")
+        return dataclasses.replace(ending, reason="; ".join(texts), failed=True)
 
     def _diagnose_last(self, ending: Ending) -> None:
         """Write the last state of the sources, which a check of the file uses."""
@@ -455,6 +422,7 @@ class Recording:
             ending=ending,
             sources={s.name: dataclasses.asdict(s.counts) for s in self._sources},
             recorder=self._recorder_facts(ending),
+            rescued=self._storage.rescued,
         )
 
 

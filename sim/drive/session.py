@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from undulog.capture.common.errors import ControlError
+from undulog.capture.common.errors import ControlError, LogWriteError
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.log.wal.segment import require_space
 from undulog.capture.log.write.channels import StringChannel
@@ -153,6 +153,7 @@ class BusSession:
             DataError: If the robot has no bus.
         """
         path, driven, robot, bus = plan.output, plan.driven, plan.robot, plan.address.name
+        self._path = path
         require_space(path, _ROOM)
         self._sink = DurableSink(path, force=plan.force, last_words=_LAST_WORDS)
         self.writer = SessionWriter(
@@ -187,7 +188,7 @@ class BusSession:
         """Why it can't go on for long: its disk, and what is missing; None while it can."""
         found = self._sink.shortage
         if found is None:
-            return None
+            return self._sink.misplaced or None
         return f"the disk at {_mount_of(found.path)} is full or fails: {found}"
 
     def write(self, tick: BusTick, t_ns: int) -> None:
@@ -297,6 +298,9 @@ class BusSession:
             self._log_faults()
         finally:
             self.writer.close()
+        if rescued := self._sink.rescued:
+            places = ", ".join(map(str, rescued))
+            raise LogWriteError(self._path, f"{self._sink.misplaced}; the session is in {places}")
 
     def _now_ns(self) -> int:
         return self._t_ns

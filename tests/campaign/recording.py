@@ -23,14 +23,14 @@ PATIENCE_S = 90.0
 
 
 @contextmanager
-def recorder(folder, buses, options=(), output=None):
+def recorder(folder, buses, options=(), output=None, **streams):
     """Record frames of other processes; errors of the recorder go to ``recorder.err``."""
     sources = [f"{name}=unix:{folder / name}.sock" for name in buses]
     command = [*UNDULOG, "record", *sources, *options, "--quiet", "--floor", "0"]
     command += ["--socket", folder / "control.sock", "-o", output or folder / "run.mcap"]
     with ExitStack() as stack:
         errors = stack.enter_context((folder / "recorder.err").open("wb"))
-        yield start(stack, *command, stderr=errors, cwd=ROOT)
+        yield start(stack, *command, stderr=errors, cwd=ROOT, **streams)
 
 
 def start(stack, *command, **options):

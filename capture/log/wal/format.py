@@ -25,7 +25,6 @@ import os
 import re
 import struct
 import zlib
-from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -36,6 +35,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
 from ...common.errors import LogWriteError
+from ...common.part_files import present_path, remove_opened
 
 LOCK_NAME = "recorder.lock"
 
@@ -51,21 +51,29 @@ class WalLock:
         """
         self._path = folder / LOCK_NAME
         try:
-            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._file = os.open(self._path, flags, 0o666)
         except OSError as error:
             raise LogWriteError(folder, f"can't be written: {error.strerror}") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(self._path.lstat(), os.fstat(self._file)):
+                raise BlockingIOError  # of a recorder that has just ended; another one has begun
         except OSError as error:
             os.close(self._file)
             if isinstance(error, BlockingIOError):
                 raise LogWriteError(folder, "another recorder is writing it") from error
             raise LogWriteError(folder, f"can't be locked: {error.strerror}") from error
 
+    @property
+    def folder(self) -> Path | None:
+        """Where the log's folder is now; None if it was deleted."""
+        where = present_path(self._file, self._path)
+        return None if where is None else where.parent
+
     def release(self) -> None:
         """Release the lock."""
-        with suppress(OSError):  # another program may have removed it
-            self._path.unlink()
+        remove_opened(self._file, self._path)
         os.close(self._file)
 
 

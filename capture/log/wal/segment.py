@@ -31,6 +31,7 @@ from pathlib import Path
 from zlib import crc32
 
 from ...common.errors import DataError, LogWriteError
+from ...common.part_files import NEW_FILE, remove_opened
 from ..mcap.batch import MessageFields
 from .format import (
     HEADER_SIZE,
@@ -353,10 +354,9 @@ class Segment:
         self._end = 0
         _WATCH.remove(self._mapping)
         self._view.close()
-        os.close(self._file)
         if remove:
-            with suppress(OSError):  # another program may have removed it
-                self.path.unlink()
+            remove_opened(self._file, self.path)
+        os.close(self._file)
 
     def _note_cut(self) -> None:
         """Take no more records."""
@@ -405,16 +405,14 @@ class ReservedSpace:
             LogWriteError: If there is no room; then no file is left.
         """
         self.path = folder / RESERVED_SPACE_NAME
-        self._there = size > 0
+        self._opened: int | None = None
         if not size:
             return
         require_space(self.path, size)
         try:
-            opened = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
-            try:
-                os.posix_fallocate(opened, 0, size)
-            finally:
-                os.close(opened)
+            self.path.unlink(missing_ok=True)
+            self._opened = os.open(self.path, os.O_WRONLY | NEW_FILE, 0o666)
+            os.posix_fallocate(self._opened, 0, size)
         except OSError as error:
             self.free()
             raise LogWriteError(
@@ -423,8 +421,9 @@ class ReservedSpace:
 
     def free(self) -> bool:
         """Free the space; return whether it was reserved."""
-        there, self._there = self._there, False
-        if there:
-            with suppress(OSError):  # another program may have removed it
-                self.path.unlink()
-        return there
+        opened, self._opened = self._opened, None
+        if opened is None:
+            return False
+        remove_opened(opened, self.path)
+        os.close(opened)
+        return True

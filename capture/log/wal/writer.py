@@ -162,6 +162,11 @@ class WriteAheadLog:
         return self._synced
 
     @property
+    def place(self) -> Path | None:
+        """Where its folder is now; None if it was deleted."""
+        return self._lock.folder
+
+    @property
     def shortage(self) -> LogWriteError | None:
         """Why the next segment can't be reserved: space runs out when the current one is full."""
         return self._shortage
@@ -287,10 +292,11 @@ class WriteAheadLog:
         finally:
             for segment in (*self._definitions, *self._sealed, self._current):
                 segment.close(remove=done)
+            folder = self.place
             self._lock.release()
-            if done:
+            if done and folder is not None:
                 with suppress(OSError):  # not empty: other files are in it
-                    self.folder.rmdir()
+                    folder.rmdir()
         if not done and self._failure is not None:
             raise self._failure
 
@@ -399,8 +405,8 @@ class WriteAheadLog:
                     path = segment.path
                     if segment.last > self._released:  # checked again: it may be released meanwhile
                         segment.sync()
-                if not named:
-                    sync_folder(self.folder)
+                if not named and (folder := self.place) is not None:
+                    sync_folder(folder)
             except OSError as error:
                 # After a failed sync the kernel may drop the pages: a second try that succeeds
                 # would prove nothing.
@@ -440,6 +446,8 @@ def _prepare(folder: Path, *, force: bool) -> WalLock:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise LogWriteError(folder, f"can't be created: {error.strerror}") from error
+    if folder.is_symlink():
+        raise LogWriteError(folder, "is a symbolic link, which is not followed; remove it")
     lock = WalLock(folder)
     try:
         found = segment_files(folder)

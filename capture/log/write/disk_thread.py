@@ -2,156 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
+import errno
 import threading
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
 from mcap.records import Metadata
 
-from ...common.errors import LogWriteError, OutputExistsError
-from ...common.part_files import NEW_FILE, publish, sync_folder, unfinished_path
+from ...common.errors import LogWriteError
 from ..file.parts import PART_RECORD
 from ..mcap.writer import McapWriter
 from ..wal.segment import FULL, ReservedSpace
 from ..wal.writer import WriteAheadLog
 from .mcap_sink import write_description, write_error
-
-
-class FileDeletedError(LogWriteError):
-    """The file that is being written was deleted."""
-
-
-class NameTakenError(LogWriteError):
-    """Another program took the final name of the file that is being written."""
-
-
-class PartStream:
-    """A file that is written later, so that the MCAP writer never waits for the disk.
-
-    It is a part file until it is whole.
-
-    Attributes:
-        path: Its final name.
-        number: The part, from 1.
-        size: Bytes of the part so far, written or not.
-    """
-
-    def __init__(self, path: Path, number: int, *, force: bool) -> None:
-        """Create the file.
-
-        Args:
-            number: The part, from 1.
-            force: Replace an existing file; processes that have it open keep the old one.
-
-        Raises:
-            OutputExistsError: If it exists and ``force`` is not given.
-            LogWriteError: If it can't be created.
-        """
-        self.path = path
-        self.number = number
-        self.size = 0
-        self._unfinished = unfinished_path(path)
-        self._force = force
-        self._pieces: list[bytes] = []
-        self._hash = hashlib.sha256()
-        self._named = False
-        try:
-            if force:
-                for earlier in (path, self._unfinished):
-                    earlier.unlink(missing_ok=True)
-            elif path.exists():
-                raise OutputExistsError(path)
-            self._file = os.open(self._unfinished, os.O_WRONLY | NEW_FILE, 0o666)
-        except FileExistsError as error:
-            if isinstance(error, OutputExistsError):
-                raise
-            raise OutputExistsError(self._unfinished) from error
-        except OSError as error:
-            raise write_error(path, error) from error
-
-    # -- for the MCAP writer ---------------------------------------------------------------
-
-    def write(self, data: bytes) -> int:
-        """Queue bytes."""
-        if data:
-            self._pieces.append(data)
-            self.size += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        """Bytes so far, written or not."""
-        return self.size
-
-    def flush(self) -> None:
-        """Do nothing: the disk thread writes."""
-
-    def take(self) -> list[bytes]:
-        """Return the bytes queued since the last call."""
-        pieces, self._pieces = self._pieces, []
-        return pieces
-
-    # -- for the disk's thread -------------------------------------------------------------
-
-    def put(self, data: memoryview) -> int:
-        """Write bytes to the file.
-
-        Raises:
-            OSError: If no byte was written.
-        """
-        written = os.write(self._file, data)
-        self._hash.update(data[:written])
-        return written
-
-    def sync(self) -> None:
-        """Sync the written bytes to the disk.
-
-        Raises:
-            FileDeletedError: If the file has no name any more, so that its contents will be lost.
-            OSError: If the disk fails.
-        """
-        try:
-            if self._named:
-                os.fdatasync(self._file)
-            else:
-                os.fsync(self._file)
-                sync_folder(self.path.parent)
-                self._named = True
-        finally:
-            if os.fstat(self._file).st_nlink == 0:
-                raise FileDeletedError(self.path, "was deleted while it was being written")
-
-    def publish(self) -> None:
-        """Give the file its final name, after the last sync.
-
-        Raises:
-            NameTakenError: If there is a file of that name meanwhile.
-            OSError: If the disk fails.
-        """
-        try:
-            publish(self._unfinished, self.path, replace=self._force)
-        except FileExistsError as error:
-            raise NameTakenError(
-                self.path,
-                f"another program made a file of this name; all is in {self._unfinished.name}",
-            ) from error
-
-    def close(self) -> str:
-        """Close the file and return the SHA-256 of its contents."""
-        with suppress(OSError):  # it was synced before; an error of close comes too late
-            os.close(self._file)
-        return self._hash.hexdigest()
-
-    def discard(self) -> None:
-        """Close and delete the file."""
-        self.close()
-        with suppress(OSError):
-            self._unfinished.unlink()
-
+from .part_stream import FileDeletedError, PartStream
 
 _PATIENCE_S = 2.0  # file systems free deleted space with a delay
 _PAUSE_S = 0.1
@@ -178,7 +44,13 @@ class _Finish:
 
 
 class DiskThread:
-    """Writes, hashes and syncs parts, in order."""
+    """Writes, hashes and syncs parts, in order.
+
+    Attributes:
+        placed: Number of each finished part to its file.
+        rescued: Those of them that are rescue files.
+        no_rescue: Why there is no rescue file of a part that was deleted.
+    """
 
     def __init__(self, wal: WriteAheadLog, ballast: ReservedSpace) -> None:
         """Start the thread.
@@ -196,6 +68,10 @@ class DiskThread:
         self._written = 0
         self._hash = ""
         self._unsynced = self._covered = 0
+        self._misplaced = ""
+        self.no_rescue: LogWriteError | None = None
+        self.placed: dict[int, Path] = {}
+        self.rescued: dict[int, Path] = {}
         self._thread = threading.Thread(target=self._work, name=f"disk {wal.folder}", daemon=True)
         self._thread.start()
 
@@ -208,6 +84,11 @@ class DiskThread:
     def trouble(self) -> LogWriteError | None:
         """Why recording must end: the failure, or a disk so full that the ballast was freed."""
         return self._failure or self._shortage
+
+    @property
+    def misplaced(self) -> str:
+        """Why a rescue file is written, one sentence; empty for none."""
+        return self._misplaced
 
     @property
     def backlog(self) -> int:
@@ -275,7 +156,12 @@ class DiskThread:
             self._failure = write_error(item.part.path, error)
 
     def _sync(self, part: PartStream) -> None:
-        part.sync()
+        try:
+            part.sync()
+        except OSError as error:
+            if not self._rescue(part, error):
+                raise
+            part.sync()
         self._unsynced = 0
         self._wal.release(self._covered)
 
@@ -292,15 +178,38 @@ class DiskThread:
             self._ends += sum(map(len, pieces))
             self._put(part, pieces)
             self._covered = max(self._covered, item.covered)
-            part.sync()
-            part.publish()
-            self._unsynced = 0
-            self._wal.release(self._covered)
+            self._sync(part)
+            self._publish(part)
         except OSError as error:
             self._failure = write_error(part.path, error)
             part.close()
             return
         self._hash = part.close()
+
+    def _publish(self, part: PartStream) -> None:
+        try:
+            part.publish()
+        except FileDeletedError as error:
+            if not self._rescue(part, error):
+                raise
+            part.publish()
+        self.placed[part.number] = part.path
+        if part.rescued:
+            self.rescued[part.number] = part.path
+
+    def _rescue(self, part: PartStream, error: OSError) -> bool:
+        """Go on in a rescue file if the file will be lost; return whether there is one."""
+        lost = part.place is None
+        if not lost and error.errno != errno.EROFS:
+            return False
+        path, why = part.path, part.misplaced if lost else f"{error.strerror}"
+        try:
+            part.rescue(self.backlog)
+        except LogWriteError as failure:
+            self.no_rescue = failure
+            return False
+        self._misplaced = f"{path}: {why}"
+        return True
 
     def _put(self, part: PartStream, pieces: list[bytes]) -> None:
         for piece in pieces:
@@ -310,7 +219,9 @@ class DiskThread:
                 try:
                     written = part.put(left)
                 except OSError as error:
-                    if error.errno not in FULL or not self._make_room(part.path, error, deadline):
+                    if error.errno in FULL and self._make_room(part.path, error, deadline):
+                        continue
+                    if not self._rescue(part, error):
                         raise
                     continue
                 left = left[written:]

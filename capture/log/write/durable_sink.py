@@ -20,7 +20,7 @@ from ..mcap.batch import MessageBatch
 from ..mcap.writer import McapWriter
 from ..wal.segment import ReservedSpace
 from ..wal.writer import WriteAheadLog, wal_folder
-from .disk_thread import DiskThread, FileDeletedError, NameTakenError, PartStream
+from .disk_thread import DiskThread
 from .mcap_sink import (
     PROFILE,
     Description,
@@ -29,6 +29,7 @@ from .mcap_sink import (
     write_description,
     write_error,
 )
+from .part_stream import FileDeletedError, NameTakenError, PartStream
 
 CHUNK_SIZE = 1 << 19
 """Bytes of messages in a chunk: as small as costs nothing in compression, since one is compressed
@@ -99,7 +100,7 @@ class DurableSink:
         self._refused: LogWriteError | None = None
         self._part_began: int = 0
         self.split_trouble: UndulogError | None = None
-        self._reported = ""
+        self._reported = self._must_end = ""
         self._open = True
         if not force:
             _refuse_existing(self.path)
@@ -154,6 +155,27 @@ class DurableSink:
     def shortage(self) -> LogWriteError | None:
         """Why recording must end soon, or has ended: no space, or a disk that fails."""
         return self._disk.trouble or self._refused or self._wal.shortage
+
+    @property
+    def must_end(self) -> str:
+        """Why the recording must end in good order, in one sentence; empty if it need not.
+
+        Its file, its write-ahead log or their folder was deleted or moved: what was accepted so far
+        and what is accepted before the end is kept.
+        """
+        if not self._must_end:
+            self._must_end = self._disk.misplaced or (self._misplaced() if self._open else "")
+        return self._must_end
+
+    @property
+    def misplaced(self) -> str:
+        """As :attr:`must_end`, as far as it is known without looking at the disk."""
+        return self._must_end or self._disk.misplaced
+
+    @property
+    def rescued(self) -> tuple[Path, ...]:
+        """Rescue files, which have what was accepted in the place of deleted ones; for the end."""
+        return tuple(self._disk.rescued.values())
 
     # -- writing ---------------------------------------------------------------------------
 
@@ -233,7 +255,8 @@ class DurableSink:
 
     def files(self) -> tuple[Path, ...]:
         """Return the parts, in order."""
-        return (self.path, *(part_path(self.path, k) for k in range(2, self.part + 1)))
+        numbers, placed = range(1, self.part + 1), self._disk.placed
+        return tuple(placed.get(k, part_path(self.path, k)) for k in numbers)
 
     def tick(self) -> list[tuple[str, str]]:
         """Flush if due; call it once a second for sessions with long pauses.
@@ -314,6 +337,7 @@ class DurableSink:
         self._disk.close()
         self._ballast.free()
         trouble = self._disk.failure or (None if whole else trouble)
+        left = self._wal.place
         if trouble is None and not whole:
             trouble = LogWriteError(self._part.path, "the last message was interrupted")
         try:
@@ -321,15 +345,13 @@ class DurableSink:
         except LogWriteError as error:
             trouble = trouble or error
         if isinstance(trouble, FileDeletedError):
-            raise FileDeletedError(
-                trouble.path, f"{_reason(trouble)}; only what {self._wal.folder} still has is left"
-            ) from trouble
+            reasons = [_reason(trouble)]
+            if self._disk.no_rescue is not None:
+                reasons.append(_reason(self._disk.no_rescue))
+            reasons.append(f"only what {left} still has is left" if left else "nothing is left")
+            raise FileDeletedError(trouble.path, "; ".join(reasons)) from trouble
         if isinstance(trouble, NameTakenError):
-            raise NameTakenError(
-                trouble.path,
-                f"{_reason(trouble)} and {self._wal.folder.name}: rename the other file, then "
-                f"'undulog log recover {self.path}'",
-            ) from trouble
+            raise trouble
         if trouble is not None:
             raise LogWriteError(
                 trouble.path,
@@ -366,6 +388,15 @@ class DurableSink:
             return
         self._split_at_ns += ((log_time_ns - self._split_at_ns) // step + 1) * step
         self._try_split()
+
+    def _misplaced(self) -> str:
+        """How the open part or the write-ahead log was deleted or moved; empty if it wasn't."""
+        if (how := self._part.misplaced) != "":
+            self._disk.write(self._part, 0)  # at once to a rescue file, if it needs one
+            return f"{self._part.path}: {how}"
+        if self._wal.place is None:
+            return f"{self._wal.folder}: was deleted while it was being written"
+        return ""
 
     def _try_split(self) -> None:
         """Split; on failure continue the open part."""

@@ -309,6 +309,8 @@ class RingStorage:
 
     part: int | None = None
     shortage: LogWriteError | None = None
+    must_end: str = ""
+    rescued: tuple[Path, ...] = ()
 
     def __init__(self, output: Path, ring_s: float) -> None:
         """Start with an empty ring of the last ``ring_s`` [s].
@@ -321,6 +323,7 @@ class RingStorage:
         self.part_path = output
         self.sink = RingSink(output, round(ring_s * 1e9))
         self.size = self._dropped = 0
+        self._is_there = True
 
     @property
     def messages(self) -> int:
@@ -343,6 +346,10 @@ class RingStorage:
             self.size += size
             text = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
             events.append(("info", text))
+        there, self._is_there = self._is_there, self.part_path.parent.is_dir()
+        if there and not self._is_there:
+            gone = f"the folder {self.part_path.parent} is gone: no mark can be written"
+            events.append(("error", gone))
         if self.sink.dropped and not self._dropped:
             held_s = self.sink.span_ns / 1e9
             events.append(("warn", f"the ring is full of bytes and holds only {held_s:.1f} s"))

@@ -1,14 +1,15 @@
 """Split sessions: parts that are read as one, and told when one is missing."""
 
+import errno
 import hashlib
-import itertools
+import os
 import shutil
-import time
 from pathlib import Path
 
 import pytest
 
 from support import durable_child as recorder
+from support.processes import wait_for
 from support.read_back import messages_of, metadata_of, read, rows_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
@@ -16,6 +17,7 @@ from undulog.capture.log.cut import cut_log
 from undulog.capture.log.file.parts import later_parts, part_path, split_part_path
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.merge import merge_logs
+from undulog.capture.log.write import part_stream
 from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = recorder.EPOCH_NS
@@ -151,33 +153,94 @@ def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):
     assert read(path) == (recorder.truth(500), [])
 
 
-def test_a_file_that_somebody_deletes_is_reported_before_the_end(tmp_path):
+@pytest.mark.parametrize("harm", ["file", "folder", "after"])
+def test_what_somebody_deletes_is_written_to_a_rescue_file(harm, tmp_path):
+    place = tmp_path / "gone"
+    place.mkdir()
+    sink = recorder.open_sink(place / "run.mcap", flush_interval_s=0.01)
+    for number in range(500):
+        recorder.write(sink, number)
+    if harm == "after":
+        wait_for(lambda: not sink.backlog, "the disk's thread", each=sink.tick)
+    (place / "run.mcap.part").unlink() if harm == "file" else shutil.rmtree(place)
+    for number in range(500, 1000):
+        recorder.write(sink, number)
+    assert sink.must_end.startswith(f"{place / 'run.mcap'}: ")
+    assert "was deleted while it was being written" in sink.must_end
+    sink.close(())
+    (rescue,) = sink.rescued
+    assert sink.files() == (rescue,)
+    assert rescue.parent == (place if harm == "file" else tmp_path)
+    assert read(rescue) == (recorder.truth(1000), [])
+    assert rows_of(rescue) == recorder.truth(1000)
+
+
+def test_a_read_only_disk_is_left_for_a_rescue_file(tmp_path, monkeypatch):
     sink = recorder.open_sink(tmp_path / "run.mcap", flush_interval_s=0.01)
-    recorder.write(sink, 0)
-    (tmp_path / "run.mcap.part").unlink()
+    real, part = os.write, tmp_path / "run.mcap.part"
 
-    def go_on():
-        for number in itertools.count(1):
-            recorder.write(sink, number)
-            time.sleep(0.001)
+    def read_only(file, data):
+        if Path(f"/proc/self/fd/{file}").readlink() == part and os.fstat(file).st_size > 10_000:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return real(file, data)
 
-    with pytest.raises(LogWriteError, match=r"run\.mcap: was deleted while it was being written"):
-        go_on()
-    kept = r"was deleted .*; only what .*run\.mcap\.wal still has"
-    with pytest.raises(LogWriteError, match=kept):
-        sink.close(())
+    monkeypatch.setattr(os, "write", read_only)
+    for number in range(2000):
+        recorder.write(sink, number)
+    wait_for(lambda: sink.must_end, "the rescue", each=sink.tick)
+    assert "Read-only file system" in sink.must_end
+    sink.close(())
+    assert rows_of(sink.rescued[0]) == recorder.truth(2000)
 
 
-def test_a_folder_that_is_gone_is_reported(tmp_path):
+def test_without_room_for_a_rescue_file_that_is_reported(tmp_path, monkeypatch):
     place = tmp_path / "gone"
     place.mkdir()
     sink = recorder.open_sink(place / "run.mcap")
     recorder.write(sink, 0)
+    monkeypatch.setattr(part_stream, "free_bytes", lambda _: 1000)
     shutil.rmtree(place)
-    with pytest.raises(LogWriteError, match="No such file"):
-        sink.split()
-    with pytest.raises(LogWriteError, match="deleted"):
+    with pytest.raises(LogWriteError) as caught:
         sink.close(())
+    for text in (
+        "was deleted",
+        "no rescue file of",
+        f"{tmp_path} has 1000 bytes",
+        "nothing is left",
+    ):
+        assert text in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == []
+
+
+def test_a_moved_folder_gets_the_whole_session(tmp_path):
+    place, moved = tmp_path / "place", tmp_path / "moved"
+    place.mkdir()
+    sink = recorder.open_sink(place / "run.mcap")
+    for number in range(500):
+        recorder.write(sink, number)
+    place.rename(moved)
+    place.mkdir()
+    other = recorder.open_sink(place / "run.mcap")  # its files have the same names
+    recorder.write(other, 0)
+    recorder.write(sink, 500)
+    assert str(moved) in sink.must_end
+    sink.close(())
+    assert (sink.files(), sink.rescued) == ((moved / "run.mcap",), ())
+    assert read(moved / "run.mcap") == (recorder.truth(501), [])
+    assert [path.name for path in moved.iterdir()] == ["run.mcap"]
+    other.close(())
+    assert read(place / "run.mcap") == (recorder.truth(1), [])
+    assert [path.name for path in place.iterdir()] == ["run.mcap"]
+
+
+def test_a_name_that_is_taken_meanwhile_leaves_both_files_whole(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap")
+    recorder.write(sink, 0)
+    (tmp_path / "run.mcap").write_text("another's")
+    with pytest.raises(LogWriteError, match=r"the recording is in .*run\.mcap\.part, whole"):
+        sink.close(())
+    assert (tmp_path / "run.mcap").read_text() == "another's"
+    assert rows_of(tmp_path / "run.mcap.part") == recorder.truth(1)
 
 
 # -- reading -------------------------------------------------------------------------------------

@@ -350,7 +350,8 @@ def test_a_recording_kept_in_a_ring_reports_its_marks(tmp_path):
     shutil.rmtree(folder)
     storage.mark("")
     wait_for(lambda: not ring.waiting, "the marks")
-    ((level, text),) = storage.tick()
+    (level, text), gone = storage.tick()
+    assert gone == ("error", f"the folder {folder} is gone: no mark can be written")
     assert level == "error"
     assert "run_mark0002.mcap" in text
     assert storage.files() == (path,)
