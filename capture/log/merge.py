@@ -330,11 +330,15 @@ def _other_robots(sources: Sequence[RawLog], robot: str) -> Iterator[str]:
 def _joint_names(source: RawLog) -> set[str]:
     """Return the joints in the first message of each JointState topic."""
     topics, found = Topics(source.file, source.warn), set[str]()
-    for topic, channel in topics.channels.items():
-        if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count:
-            with suppress(DataError):  # of a damaged message
-                first = topics.first(topic)
-                found.update(() if first is None else names_of(layout_of(first[2], first[1])))
+    pending = {
+        topic
+        for topic, channel in topics.channels.items()
+        if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count
+    }
+    for topic, message in topics.raw_of(pending):
+        pending.discard(topic)
+        with suppress(DataError):  # of a damaged message
+            found.update(names_of(layout_of(topics.message_type(topic), message)))
     return found
 
 

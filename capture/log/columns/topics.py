@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -131,6 +132,11 @@ class Topics:
         return dict(zip(wanted, found, strict=True))
 
     @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self._file.path
+
+    @property
     def is_ours(self) -> bool:
         """Whether undulog wrote the file, so that its log times are close to the stamps."""
         return self._file.library.startswith("undulog/")
@@ -190,6 +196,28 @@ class Topics:
                         stop_ns is None or log_ns < stop_ns
                     ):
                         yield log_ns, bytes(data[at + BODY_AT : at + PREFIX_SIZE + length])
+
+    def raw_of(self, pending: set[str]) -> Iterator[tuple[str, bytes]]:
+        """Yield the messages of several topics as bytes, each block decompressed once.
+
+        Args:
+            pending: The topics; one that is removed meanwhile yields no more, and none is the end.
+
+        Yields:
+            Topic and the message's bytes; those of one topic in the order of the file.
+        """
+        for block in blocks_in(self._file, (None, None)):
+            names = [topic for topic in self._ids if topic in pending]
+            if not names:
+                return
+            wanted = [self._ids[topic] for topic in names]
+            for data, found in record_batches(self._file, wanted, [block], self._warn):
+                for topic, records in zip(names, found, strict=True):
+                    for at in records.offsets.tolist():
+                        if topic not in pending:
+                            break
+                        _, length, *_ = MESSAGE.unpack_from(data, at)
+                        yield topic, bytes(data[at + BODY_AT : at + PREFIX_SIZE + length])
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
         """Return the general decoder of a topic, for messages of any shape.

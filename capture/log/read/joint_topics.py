@@ -7,9 +7,10 @@ leaves a choice the words of the topic's name; what was taken is reported.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -42,31 +43,54 @@ if TYPE_CHECKING:
 _LOOKED_AT = 2000
 """Messages of a topic; one with a message a joint names all its joints in them."""
 
+_MOST_TOPICS = 2000
+"""Topics of joints; of each the first message is decoded."""
+
 _MOST_LISTED = 12
 
 
 def joint_names(topics: Topics) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each topic that names some, in the order in which they appear."""
-    found = {
-        topic: _names(topics, topic)
+    """Return the joints of each topic that names some, in the order in which they appear.
+
+    Raises:
+        DataError: If the log has more topics of joints than any robot.
+    """
+    decoders: dict[str, Callable[[bytes], Any]] = {}
+    for topic in _of_joints(topics):
+        with suppress(DataError):  # a damaged schema: reported where the topic is read
+            decoders[topic] = topics.decoder(topic)
+    found: dict[str, dict[str, None]] = {topic: {} for topic in decoders}
+    looked_at, pending = Counter[str](), set(decoders)
+    for topic, message in topics.raw_of(pending):
+        looked_at[topic] += 1
+        try:
+            own = _joints(decoders[topic](message))
+        except DataError:  # a damaged message: likewise
+            found[topic], own = {}, []
+            pending.discard(topic)
+        found[topic] |= dict.fromkeys(own)
+        if len(own) > 1 or looked_at[topic] == _LOOKED_AT:  # all joints in one message
+            pending.discard(topic)
+    return {topic: tuple(names) for topic, names in found.items() if names}
+
+
+def _of_joints(topics: Topics) -> list[str]:
+    """Return the topics whose type is one of joints.
+
+    Raises:
+        DataError: If there are more than of any robot.
+    """
+    names = [
+        topic
         for topic, channel in topics.channels.items()
         if channel.type_name in JOINT_TYPES and channel.is_ros2
-    }
-    return {topic: names for topic, names in found.items() if names}
-
-
-def _names(topics: Topics, topic: str) -> tuple[str, ...]:
-    names: dict[str, None] = {}
-    try:
-        decode = topics.decoder(topic)
-        for _, message in islice(topics.raw(topic), _LOOKED_AT):
-            own = _joints(decode(message))
-            names |= dict.fromkeys(own)
-            if len(own) > 1:  # all joints in one message
-                break
-    except DataError:  # a damaged schema or message: reported where the topic is read
-        return ()
-    return tuple(names)
+    ]
+    if len(names) > _MOST_TOPICS:
+        raise DataError(
+            f"{topics.path}: {len(names)} topics of joints, over {_MOST_TOPICS}; "
+            "take out some of them: undulog log cut --topics"
+        )
+    return names
 
 
 def _joints(message: Any) -> list[str]:
@@ -180,6 +204,7 @@ class JointTopicFinder:
             joints: Of the robot, in chain order; none if it is unknown.
         """
         self._path, self._topics, self._joints = path, topics, tuple(joints)
+        self._first: dict[str, bytes] | None = None
 
     def find(self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC) -> JointTopics:
         """Find commands and responses.
@@ -191,7 +216,8 @@ class JointTopicFinder:
 
         Raises:
             MissingChannelError: If a topic that was chosen is not there.
-            DataError: If an array was chosen whose joints are unknown.
+            DataError: If an array was chosen whose joints are unknown, or the log has more topics
+                of joints than any robot.
         """
         channels = self._topics.channels
         named = {command: COMMAND_TOPIC, response: RESPONSE_TOPIC}
@@ -339,9 +365,14 @@ class JointTopicFinder:
         return leaf.count if leaf else 0
 
     def _first_layout(self, topic: str) -> Layout | None:
+        if self._first is None:  # of all topics in one pass
+            self._first, pending = {}, set(_of_joints(self._topics))
+            for name, message in self._topics.raw_of(pending):
+                pending.discard(name)
+                self._first[name] = message
         try:
-            first = self._topics.first(topic)
-            return None if first is None else layout_of(first[2], first[1])
+            first = self._first.get(topic)
+            return None if first is None else layout_of(self._topics.message_type(topic), first)
         except DataError:  # whoever reads the topic reports it
             return None
 
