@@ -216,6 +216,7 @@ def test_frames_that_are_computed(data, tmp_path):
         names = [row[1] for row in base.execute("PRAGMA table_info(messages)")]
         kept = ", ".join(name for name in names if name != "data")
         base.executescript(
+            "DELETE FROM messages WHERE rowid > 3; "
             f"ALTER TABLE messages RENAME TO old; CREATE TABLE messages({kept}, data AS ({data}));"
             f"INSERT INTO messages({kept}) SELECT {kept} FROM old; DROP TABLE old; VACUUM;"
         )

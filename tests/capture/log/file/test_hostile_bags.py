@@ -44,7 +44,7 @@ COMPUTED = {
 @pytest.mark.parametrize("verb", [("log", "info"), ("log", "check"), ("analyse",)])
 @pytest.mark.parametrize("name", COMPUTED)
 def test_messages_that_are_computed(verb, name, tmp_path):
-    rows = 2 if name == "checked" else 3000
+    rows = 3000 if name == "zeros" else 2  # SQLite computes the others already as it writes them
     path = database(tmp_path / f"{name}.db3", f"{MESSAGES}, {COMPUTED[name]}", rows=rows)
     assert path.stat().st_size < 500_000
     assert "table messages has" in refused(path, *verb, path.name)
