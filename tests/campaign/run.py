@@ -21,7 +21,16 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from . import contention, disks, gate, hostile, injection, kills, servers
+from . import (
+    contention,
+    disks,
+    gate,
+    hostile,
+    injection,
+    interruptions_drive,
+    kills,
+    servers,
+)
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
 from .stage import Stage
@@ -62,6 +71,7 @@ def mutated(seed, stage, part="mutated"):
 PARTS = {
     "contention": Part(contention.run, 6, 1, alone=True),
     "gate": Part(gate.run, 40, 3, alone=True),
+    "interruptions_drive": Part(interruptions_drive.run, 40, 5, alone=True),
     "servers": Part(servers.run, 60, len(servers.ATTACKS)),
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 12),
@@ -73,7 +83,7 @@ PARTS = {
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 35_214, 120),
+    "mutated": Part(mutated, 35_174, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 
