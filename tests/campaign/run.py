@@ -29,6 +29,7 @@ from . import (
     injection,
     interruptions_drive,
     kills,
+    line_recorder,
     servers,
 )
 from .case import Result
@@ -78,12 +79,13 @@ PARTS = {
     "disks": Part(disks.run, 400, 15),
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
+    "line_recorder": Part(line_recorder.run, 20, 2),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 35_174, 120),
+    "mutated": Part(mutated, 35_154, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 
