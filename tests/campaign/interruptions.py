@@ -21,7 +21,7 @@ from .case import Result
 from .recording import PATIENCE_S, Sending, start
 from .recording import SENDER as PACKET_SENDER
 
-LINE_SENDER = Path(__file__).with_name("line_sender.py")
+NUMBERED_SENDER = Path(__file__).with_name("numbered_sender.py")
 RATE = 3000
 """Frames a second of each of two sources: 6,000 packets or lines a second."""
 
@@ -109,7 +109,7 @@ def line_up(folder, stack, kind, seconds):
             words = [PACKET_SENDER, folder / f"{bus}.sock", log, RATE, 1, seconds]
             addresses.append(f"{bus}=unix:{folder / bus}.sock")
         else:
-            words = [LINE_SENDER, kind, place, log, RATE, seconds]
+            words = [NUMBERED_SENDER, kind, place, log, RATE, seconds]
         process = start(
             stack, sys.executable, *words, stdout=subprocess.PIPE, stdin=subprocess.PIPE
         )

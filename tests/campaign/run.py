@@ -29,7 +29,9 @@ from . import (
     hostile,
     injection,
     interruptions,
+    interruptions_drive,
     kills,
+    line_recorder,
     marks,
     results,
     servers,
@@ -75,6 +77,7 @@ PARTS = {
     "contention": Part(contention.run, 6, 1, alone=True),
     "gate": Part(gate.run, 40, 3, alone=True),
     "interruptions": Part(interruptions.run, 60, 4),
+    "interruptions_drive": Part(interruptions_drive.run, 40, 5, alone=True),
     "servers": Part(servers.run, 60, len(servers.ATTACKS)),
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 12),
@@ -84,13 +87,14 @@ PARTS = {
     "recorder": Part(kills.run_recorder, 50, 2),
     "results": Part(results.run, 2_000, 15),
     "marks": Part(marks.run, 100, 3),
+    "line_recorder": Part(line_recorder.run, 20, 2),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "binary": Part(partial(mutated, part="binary"), 4_500, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 30_554, 120),
+    "mutated": Part(mutated, 30_494, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 
