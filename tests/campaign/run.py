@@ -94,7 +94,7 @@ PARTS = {
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "binary": Part(partial(mutated, part="binary"), 4_500, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 30_494, 120),
+    "mutated": Part(mutated, 24_994, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 
