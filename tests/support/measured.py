@@ -1,10 +1,10 @@
 """The command as a process whose time and memory the kernel reports, those of its children too."""
 
-import os
-import subprocess
+import json
+import sys
 from dataclasses import dataclass
 
-from support.processes import UNDULOG
+from support.processes import UNDULOG, run
 
 CPU_S = 20.0
 PEAK_BYTES = 1 << 30
@@ -28,20 +28,28 @@ class Measured:
     peak: int
 
 
+_LAUNCHER = """
+import json, os, subprocess, sys
+streams = [open(path, "wb") for path in sys.argv[1:3]]
+running = subprocess.Popen(sys.argv[3:], stdin=subprocess.DEVNULL, stdout=streams[0],
+                           stderr=streams[1])
+_, status, used = os.wait4(running.pid, 0)
+running.returncode = os.waitstatus_to_exitcode(status)
+print(json.dumps([running.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024]))
+"""
+"""A small process: a child counts the memory of the one that starts it as its own."""
+
+
 def undulog_measured(*words, cwd):
     """Run a command to its end."""
     paths = [cwd / name for name in ("measured.out", "measured.err")]
-    with paths[0].open("wb") as out, paths[1].open("wb") as err:
-        running = subprocess.Popen(
-            [*UNDULOG, *map(str, words)], cwd=cwd, stdin=subprocess.DEVNULL, stdout=out, stderr=err
-        )
-        _, status, used = os.wait4(running.pid, 0)
-        running.returncode = os.waitstatus_to_exitcode(status)
+    launcher = (sys.executable, "-I", "-S", "-c", _LAUNCHER, *paths)
+    done = run(*launcher, *UNDULOG, *words, cwd=cwd, code=0)
+    code, cpu_s, peak = json.loads(done.stdout)
     texts = [path.read_text(errors="replace") for path in paths]
     for path in paths:
         path.unlink()
-    cpu_s = used.ru_utime + used.ru_stime
-    return Measured(running.returncode, *texts, cpu_s, used.ru_maxrss * 1024)
+    return Measured(code, *texts, cpu_s, peak)
 
 
 def refused(path, *words):

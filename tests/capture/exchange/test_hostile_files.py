@@ -114,7 +114,7 @@ def test_a_tensor_file_of_nested_tuples(end, tmp_path):
     depth = 60
     pickle = b"\x80\x02" + nested(depth) + end.replace(b"%c", bytes([depth]))
     path = pickled(tmp_path / "nested.pt", pickle)
-    assert path.stat().st_size < 1000
+    assert path.stat().st_size < 2000
     refused(path, *imported(path))
 
 
@@ -122,7 +122,7 @@ def test_arrays_that_are_as_large_as_may_be(tmp_path):
     """Two to the 25 numbers are the most that a small file may have."""
     rows = (1 << 25) // 2
     path = tmp_path / "wide.npz"
-    np.savez_compressed(path, time=np.arange(rows, dtype=float), joint1_pos=np.zeros(rows))
+    np.savez_compressed(path, time=np.zeros(rows), joint1_pos=np.zeros(rows))
     refused(path, *imported(path))
 
 
@@ -164,7 +164,8 @@ def test_a_list_of_a_hundred_million_equal_numbers(tmp_path):
     offsets = pa.array([0, many, many, many], pa.int32())
     lists = pa.ListArray.from_arrays(offsets, pa.array(np.zeros(many, "f4")))
     path = tmp_path / "list.parquet"
-    parquet.write_table(pa.table({"time": [0.0, 0.1, 0.2], "joint1_pos": lists}), path)
+    table = pa.table({"time": [0.0, 0.1, 0.2], "joint1_pos": lists})
+    parquet.write_table(table, path, compression="zstd")
     assert path.stat().st_size < 500_000
     refused(path, *imported(path))
 
