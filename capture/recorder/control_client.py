@@ -64,10 +64,9 @@ def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Pat
     folder = socket_folder(environ)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
     except OSError as error:
         raise ControlError(f"{folder}: no folder for the control socket: {error}") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+    if not _is_own(folder):
         raise ControlError(f"{folder}: not a folder of this user; name a socket with --socket")
     number = zlib.crc32(os.fsencode(output.absolute()))
     stem = output.stem
@@ -77,8 +76,18 @@ def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Pat
 def find_sockets(environ: Mapping[str, str]) -> list[Path]:
     """Return the control sockets of the running recorders of this user and of services, sorted."""
     folder = socket_folder(environ)
-    found = {path for where in (folder, _SYSTEM_FOLDER) for path in _sockets_below(where)}
+    folders = [folder, _SYSTEM_FOLDER] if _is_own(folder) else [_SYSTEM_FOLDER]
+    found = {path for where in folders for path in _sockets_below(where)}
     return sorted(path for path in found if _is_in_use(path))
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether a folder is this user's: among the temporary files another user may have made it."""
+    try:
+        facts = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid()
 
 
 def listen(

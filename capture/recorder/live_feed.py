@@ -12,6 +12,7 @@ import importlib.util
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -365,6 +366,7 @@ class LiveFeed:
         if self._socket is None:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
+            _require_trusted(self.path)
             self._socket.connect(str(self.path))
         except OSError:  # no relay: looked for again later
             self._lose(now_ns)
@@ -390,3 +392,14 @@ class LiveFeed:
         self._unsent_definitions.clear()
         self._due = {}
         self._renew_at_ns = now_ns + RETRY_NS
+
+
+def _require_trusted(path: Path) -> None:
+    """Check that a relay's socket is this user's or root's: a shared folder has others, too.
+
+    Raises:
+        OSError: If there is no such socket, or it is another user's.
+    """
+    facts = path.lstat()
+    if not stat.S_ISSOCK(facts.st_mode) or facts.st_uid not in (os.geteuid(), 0):
+        raise PermissionError(errno.EPERM, "no socket of this user", str(path))

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import threading
 import time
 from collections.abc import Sequence
@@ -446,8 +447,7 @@ def _prepare(folder: Path, *, force: bool) -> WalLock:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise LogWriteError(folder, f"can't be created: {error.strerror}") from error
-    if folder.is_symlink():
-        raise LogWriteError(folder, "is a symbolic link, which is not followed; remove it")
+    _refuse_foreign(folder)
     lock = WalLock(folder)
     try:
         found = segment_files(folder)
@@ -461,3 +461,15 @@ def _prepare(folder: Path, *, force: bool) -> WalLock:
             raise
         raise LogWriteError(folder, f"can't be created: {error.strerror}") from error
     return lock
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Refuse a folder that another user planted where several may write, or a link to one."""
+    try:
+        facts, above = folder.lstat(), folder.absolute().parent.stat()
+    except OSError as error:
+        raise LogWriteError(folder, f"can't be used: {error.strerror}") from error
+    if stat.S_ISLNK(facts.st_mode):
+        raise LogWriteError(folder, "is a symbolic link, which is not followed; remove it")
+    if facts.st_uid not in (os.geteuid(), above.st_uid):
+        raise LogWriteError(folder, "is another user's; name another output")

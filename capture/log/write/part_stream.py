@@ -81,7 +81,7 @@ class PartStream:
             if force:
                 for earlier in (path, self._unfinished):
                     earlier.unlink(missing_ok=True)
-            elif path.exists():
+            elif os.path.lexists(path):
                 raise OutputExistsError(path)
             self._file = os.open(self._unfinished, os.O_RDWR | NEW_FILE, 0o666)
         except FileExistsError as error:
