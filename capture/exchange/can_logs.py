@@ -1,7 +1,7 @@
 """Logs of CAN frames that other tools write, as blocks of frames.
 
-candump is read here; the other formats by python-can and asammdf, in a child process. Logs whose
-times count from their own start (ASC, some TRC) are put at
+candump is read here, other texts by python-can, binary formats by python-can and asammdf in a child
+process. Logs whose times count from their own start (ASC, some TRC) are put at
 :data:`.capture.exchange.frame_log.RELATIVE_EPOCH_NS`.
 """
 
@@ -29,6 +29,9 @@ from .frame_log import LATEST_NS, FrameLog, LogBlock
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 """Suffixes of the logs that can be read, each also with ``.gz`` behind it where it is text."""
 
+_TEXTS = (".asc", ".trc", ".csv")
+"""Read by Python code alone, line by line: no child process is needed."""
+
 _CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
@@ -51,6 +54,12 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
         opener = gzip.open if path.suffix == ".gz" else open
         with cast("TextIO", opener(path, "rt", encoding="ascii", errors="replace")) as lines:
             yield _datable(read_candump(path, _lines(path, lines)))
+        return
+    if suffix in _TEXTS:
+        from .can_readers import open_log
+
+        with open_log(path, suffix) as log:
+            yield _datable(log)
         return
     if suffix == ".mf4" and not is_installed("asammdf"):
         raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf")

@@ -86,12 +86,18 @@ def imported(path, robot):
     assert why is None or str(path) in why
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+BINARY = (".blf", ".db")
+"""Each import starts a process."""
+
+
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(s, marks=pytest.mark.slow) if s in BINARY else s for s in SUFFIXES]
+)
 def test_mutated_traces_end_in_a_session_or_an_error_of_ours(suffix, traces, robot, tmp_path):
     for seed in range(CASES):
         rng = random.Random(f"{suffix} {seed}")
         path = tmp_path / f"{seed}{suffix}"
-        path.write_bytes(mutated(traces[suffix], rng, text=suffix not in (".blf", ".db")))
+        path.write_bytes(mutated(traces[suffix], rng, text=suffix not in BINARY))
         imported(path, robot)
 
 
@@ -112,6 +118,7 @@ def test_each_odd_number_in_a_text(suffix, number, traces, robot, tmp_path):
         imported(path, robot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [None, "text", b"\xff", 1e308, float("inf"), -1, 2**62])
 def test_each_odd_value_in_a_database(value, traces, robot, tmp_path):
     columns = ("ts", "arbitration_id", "extended", "remote", "error", "dlc", "data")
