@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 from . import errors
+from .confined_child import STOP, TAKEN
 from .errors import LogError, UndulogError
 from .files import check_regular
 from .packets import Packet, receive, send
@@ -60,9 +61,12 @@ _LOOK_S = 5.0
 _END_S = 10.0
 """To wait for a child whose socket is closed already [s]."""
 
+_STOP_S = 0.5
+"""To wait for a parser that is asked to stop; starting another one takes as long [s]."""
+
 _CODE = (
     "import sys; sys.path[:] = sys.argv[3:]; "
-    f"from {__package__}.confined_child import serve; serve(int(sys.argv[1]), int(sys.argv[2]))"
+    f"from {__name__}_child import serve; serve(int(sys.argv[1]), int(sys.argv[2]))"
 )
 
 _MOST_THREADS = 4
@@ -110,7 +114,7 @@ def size_of(path: Path) -> int:
 class Confined:
     """Runs parsers in a child process, which is kept for the next one and ends with the object.
 
-    A child that failed, or whose packets were not all taken, is ended at once.
+    A child that failed, or that doesn't stop where its packets are not all taken, is ended.
     """
 
     def __init__(self, kind: type[LogError]) -> None:
@@ -145,7 +149,6 @@ class Confined:
         except OSError as error:
             raise self._kind(path, f"can't be read: {error.strerror or error}") from error
         child = self._idle.pop() if self._idle else self._started(path)
-        finished = False
         try:
             try:
                 child.request(parser, path, limits, options)
@@ -155,9 +158,8 @@ class Confined:
                 child.request(parser, path, limits, options)
             while (packet := self._packet(child, path, limits)) is not None:
                 yield packet
-            finished = True
         finally:
-            if finished:
+            if child.stopped(limits):
                 self._idle.append(child)
             else:
                 child.end()
@@ -193,6 +195,7 @@ class Confined:
             child.taken()
             return packet
         failure = packet.facts["end"]
+        child.is_free = failure.get("kind") != MemoryError.__name__  # it may hold what it took
         if failure:
             raise self._error(path, failure, limits)
         return None
@@ -244,9 +247,14 @@ def _end_all(children: list[_Child]) -> None:
 
 
 class _Child:
-    """One child process, and the socket to it."""
+    """One child process, and the socket to it.
+
+    Attributes:
+        is_free: Whether it waits for a request.
+    """
 
     def __init__(self) -> None:
+        self.is_free = True
         self._owner = os.getpid()
         self._link, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         alive, self._alive = os.pipe2(os.O_CLOEXEC)
@@ -270,6 +278,7 @@ class _Child:
 
     def request(self, parser: str, path: Path, limits: Limits, options: Mapping[str, Any]) -> None:
         facts = {"parser": parser, "path": str(path), "limits": asdict(limits), "options": options}
+        self.is_free = False
         send(self._link, Packet(facts))
 
     def next(self, limits: Limits) -> Packet | None:
@@ -304,7 +313,23 @@ class _Child:
     def taken(self) -> None:
         """Let the parser go one packet further."""
         with suppress(OSError):  # it ended: the next packet is its end
-            self._link.send(b"+")
+            self._link.send(TAKEN)
+
+    def stopped(self, limits: Limits) -> bool:
+        """Have the parser stop if it hasn't; return whether the child is of use again."""
+        if self.is_free:
+            return True
+        poller = select.poll()
+        poller.register(self._link, select.POLLIN)
+        try:
+            self._link.send(STOP)
+            while poller.poll(_STOP_S * 1000) and (packet := receive(self._link, limits.file_size)):
+                if "end" in packet.facts:
+                    self.is_free = True
+                    return True
+        except (ValueError, LookupError, TypeError, OSError):
+            return False
+        return False
 
     def ended(self) -> int | None:
         """Return the exit code of a child that ends; None if it doesn't."""
@@ -332,7 +357,7 @@ def _command(channel: int, alive: int) -> list[str]:
     """
     if not sys.executable:
         raise OSError("no interpreter is known (sys.executable)")
-    root = str(Path(sys.modules[__package__.partition(".")[0]].__path__[0]).parent)
+    root = str(Path(sys.modules[__name__.partition(".")[0]].__path__[0]).parent)
     modules = [str(Path(entry).absolute()) for entry in sys.path]
     flags = ["-I", "-S", "-W", "ignore", *(["-B"] if sys.dont_write_bytecode else [])]
     return [sys.executable, *flags, "-c", _CODE, str(channel), str(alive), *modules, root]

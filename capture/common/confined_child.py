@@ -26,6 +26,9 @@ from .packets import Packet, receive, send
 Send: TypeAlias = Callable[[Packet], None]
 """Hands a packet to the parent; waits while :data:`AHEAD` of them are not taken."""
 
+TAKEN, STOP = b"+", b"x"
+"""Messages of the parent: a packet was taken; no more are wanted."""
+
 AHEAD = 2
 """Packets that a parser may be ahead of the parent: one to take, one to fill meanwhile."""
 
@@ -45,7 +48,7 @@ def serve(channel: int, alive: int) -> None:
     _end_with(alive)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with socket.socket(fileno=channel) as link:
-        while (request := receive(link, LARGEST_REQUEST)) is not None:
+        while (request := receive(link, LARGEST_REQUEST, skip=True)) is not None:
             send(link, Packet({"end": _answer(request.facts, _Sender(link))}))
 
 
@@ -58,6 +61,10 @@ def _end_with(alive: int) -> None:
         sys.exit()
 
 
+class _Stopped(BaseException):
+    """The parent wants no more packets; not to be caught by a parser."""
+
+
 class _Sender:
     """Sends packets, a few ahead of those that the parent has taken."""
 
@@ -66,17 +73,11 @@ class _Sender:
 
     def __call__(self, packet: Packet) -> None:
         while not self._left:
-            taken = self._link.recv(1)
-            if not taken:
-                sys.exit()  # the parent wants no more
+            if self._link.recv(1) != TAKEN:
+                raise _Stopped
             self._left += 1
         self._left -= 1
         send(self._link, packet)
-
-    def settle(self) -> None:
-        """Wait until the parent has taken all packets."""
-        while self._left < AHEAD and self._link.recv(1):
-            self._left += 1
 
 
 def _answer(facts: Any, sender: _Sender) -> dict[str, Any]:
@@ -96,8 +97,8 @@ def _answer(facts: Any, sender: _Sender) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - libraries raise anything; the parent reports it
         text = " ".join(str(error).split())
         failure = {"kind": "", "text": f"{type(error).__name__}: {text}"}
-    finally:
-        sender.settle()
+    except _Stopped:
+        pass
     return failure
 
 

@@ -80,17 +80,20 @@ def send(channel: socket.socket, packet: Packet) -> None:
         os.close(descriptor)
 
 
-def receive(channel: socket.socket, most: int) -> Packet | None:
+def receive(channel: socket.socket, most: int, *, skip: bool = False) -> Packet | None:
     """Return the next packet; None if the other end is closed.
 
     Args:
         most: Bytes that it may have.
+        skip: Whether to pass over messages that carry none.
 
     Raises:
         ValueError: If it is no packet, or a larger one.
         OSError: If the socket fails.
     """
     data, descriptors, _, _ = socket.recv_fds(channel, 16, 1)
+    while data and skip and not descriptors:
+        data, descriptors, _, _ = socket.recv_fds(channel, 16, 1)
     if not data:
         return None
     if len(descriptors) != 1:
@@ -123,7 +126,7 @@ def _write(descriptor: int, packet: Packet) -> None:
     begin = _begin(len(header))
     _write_at(descriptor, _HEAD.pack(len(header)) + header, 0)
     for start, stop in regions:
-        _write_at(descriptor, memoryview(np.asarray(_Memory(start, stop))), begin + places[start])
+        _write_at(descriptor, np.asarray(_Memory(start, stop)).data, begin + places[start])
 
 
 def _begin(header: int) -> int:

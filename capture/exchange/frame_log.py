@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice, pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,9 @@ from ..log.messages.frames import (
     holds_fd,
     widened,
 )
-from ..log.read.session_view import SessionView
+
+if TYPE_CHECKING:
+    from ..log.read.session_view import SessionView
 
 RELATIVE_EPOCH_NS = 946_684_800_000_000_000
 """Start of a log without a date: 2000-01-01T00:00:00Z [Unix ns]."""

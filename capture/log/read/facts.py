@@ -261,7 +261,8 @@ def _of_file(path: Path) -> Stated:
         raise ImportError("rosbags")
     with closing(Confined(NotALogError)) as reader:
         facts = reader.call(f"{__name__}:parse", path).facts
-    return Stated([path], "", *facts["times"], facts["messages"], tuple(facts["topics"]))
+    start_ns, duration_ns = facts["times"]
+    return Stated([path], "", start_ns, duration_ns, facts["messages"], tuple(facts["topics"]))
 
 
 def parse(path: Path, send: Send) -> None:
