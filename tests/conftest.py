@@ -94,7 +94,7 @@ def pytest_sessionstart(session):
     with capture.global_and_fixture_disabled() if capture else contextlib.nullcontext():
         stderr = os.dup(2)  # that of the run, not of a test
     faulthandler.register(signal.SIGUSR2, file=stderr, all_threads=True)
-    words = [sys.executable, "-S", "-E", str(WATCHER), str(stderr)]
+    words = [sys.executable, "-S", "-E", str(WATCHER), str(stderr), str(os.getpid())]
     _watching = subprocess.Popen(words, stdin=subprocess.PIPE, pass_fds=[stderr])
 
 

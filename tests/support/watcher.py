@@ -2,7 +2,7 @@
 
 It is a process of its own, so that it also ends a run whose interpreter is held by compiled code.
 
-Usage: ``watcher.py STDERR``, the handle of the standard error of the run, its parent. Lines on
+Usage: ``watcher.py STDERR RUN``: the handle of the run's standard error and its process. Lines on
 standard input: ``SECONDS NAME`` begins a wait, an empty one ends it. Time counts by the watcher's
 own looks, so that a computer that slept is no reason.
 """
@@ -57,10 +57,10 @@ def end(run, stderr, name, limit_s):
     os.kill(run, signal.SIGKILL)
 
 
-def main(stderr):
-    """Watch the parent until its pipe closes."""
+def main(stderr, run):
+    """Watch a run until its pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is the run's own
-    run, name, left_s, limit_s, text = os.getppid(), "", 0.0, 0.0, b""
+    name, left_s, limit_s, text = "", 0.0, 0.0, b""
     while True:
         if select.select([0], [], [], LOOK_S)[0]:
             data = os.read(0, 65536)
@@ -78,4 +78,4 @@ def main(stderr):
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), int(sys.argv[2]))
