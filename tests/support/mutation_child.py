@@ -117,9 +117,8 @@ def main():
         warnings.simplefilter("error")
         for files in corpus.values():  # everything that is loaded lazily is loaded now
             lay_out(files, folder / "whole")
-            check_and_read(
-                folder / "whole" / next(path for path in files if path.endswith(".mcap"))
-            )
+            stored = next(path for path in files if path.endswith((".mcap", ".mcap.part")))
+            check_and_read(folder / "whole" / stored.removesuffix(".part"))
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
         before = in_use()
