@@ -118,6 +118,16 @@ def test_packets_that_are_not_taken_end_the_process(reader, path):
     assert reader.call(f"{PARSERS}:process", path).facts["pid"] != pid
 
 
+def test_a_parser_stops_where_its_packets_are_not_taken(reader, path):
+    pid = reader.call(f"{PARSERS}:process", path).facts["pid"]
+    for taken in range(6):
+        packets = reader.stream(f"{PARSERS}:many", path, number=5)
+        assert [next(packets).facts["k"] for _ in range(min(taken, 5))] == list(range(taken))[:5]
+        packets.close()
+        assert reader.call(f"{PARSERS}:process", path).facts["pid"] == pid
+    assert int((path.parent / "sent").read_text()) == 5
+
+
 def test_a_parser_waits_for_a_slow_parent(reader, path):
     packets = reader.stream(f"{PARSERS}:many", path, number=20)
     sent = path.parent / "sent"

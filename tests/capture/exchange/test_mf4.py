@@ -15,8 +15,8 @@ from support.written_frames import log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.can_logs import open_frame_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
+from undulog.capture.exchange.mf4 import open_mf4
 from undulog.capture.log.messages.frames import ERROR_FLAG, REMOTE_FLAG
 
 asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
@@ -29,8 +29,8 @@ START_NS = 1_709_208_000_125_000_000
 
 
 def read(path):
-    """Everything in a file: frames, name of each one's bus, the log."""
-    with open_frame_log(path) as log:
+    """Everything in a file: frames, name of each one's bus, the log; without a child process."""
+    with open_mf4(path, path.parent) as log:
         blocks = list(log.blocks)
         frames = joined(blocks).classic()
         buses = [log.buses[i] for block in blocks for i in block.bus]
