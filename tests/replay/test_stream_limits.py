@@ -2,20 +2,22 @@
 
 import os
 import sys
+from contextlib import contextmanager
 
 import pytest
 
 from support.processes import python, run, wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError, NoAnswerError
-from undulog.replay import stream
+from undulog.capture.common.files import part_file
+from undulog.replay import recording, stream
 from undulog.replay.recording import open_recording, recording_file, write_recording
 from undulog.replay.stream import RrdFile
 
 # The sink of the stream is a pipe that nobody empties: Rerun's own thread stands still.
 STUCK = """
 import os, sys, numpy as np, rerun as rr
-from undulog.replay import stream
+from undulog.replay import recording, stream
 from undulog.replay.recording import open_recording
 stream.LIMIT_S = 1.0
 reads, writes = os.pipe()
@@ -82,18 +84,26 @@ def test_a_disk_that_takes_nothing_is_an_error(tmp_path):
         os.close(reads)
 
 
+@contextmanager
+def stalled_part_file(path):
+    """A part file on a disk that takes nothing: a pipe that nobody reads."""
+    with part_file(path) as draft:
+        draft.unlink()
+        os.mkfifo(draft)
+        reads = os.open(draft, os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            yield draft
+        finally:
+            os.close(reads)
+
+
 def test_while_a_disk_takes_nothing_rerun_is_waited_for_within_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(stream, "LIMIT_S", 0.5)
+    monkeypatch.setattr(recording, "part_file", stalled_part_file)
     path = tmp_path / "a.rrd"
-    draft = tmp_path / "a.rrd.part"
-    os.mkfifo(draft)
-    reads = os.open(draft, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        with pytest.raises(NoAnswerError), recording_file(path, "a", "a", 0) as rec:  # noqa: PT012
-            log_noise(rec, count=100)
-            rec.flush()
-    finally:
-        os.close(reads)
+    with pytest.raises(NoAnswerError), recording_file(path, "a", "a", 0) as rec:  # noqa: PT012
+        log_noise(rec, count=100)
+        rec.flush()
     assert list(tmp_path.iterdir()) == []
 
 
