@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from . import contention, disks, gate, hostile, injection, kills, results, servers
+from . import contention, disks, gate, hostile, injection, kills, results, servers, texts
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
 from .stage import Stage
@@ -69,6 +69,7 @@ PARTS = {
     "kills": Part(kills.run, 1500, 12),
     "recorder": Part(kills.run_recorder, 50, 2),
     "results": Part(results.run, 2_000, 15),
+    "texts": Part(texts.run, 2_000, 15),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
