@@ -39,7 +39,18 @@ from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts
 
 from .files import CatalogFiles, settled
-from .rows import SCHEMAS, SWEPT, Row, is_result, result_rows, session_row, sweep_rows, table_of
+from .queries import TOO_LARGE, query_process
+from .rows import (
+    SCHEMAS,
+    SWEPT,
+    Row,
+    check_installed,
+    is_result,
+    result_rows,
+    session_row,
+    sweep_rows,
+    table_of,
+)
 from .sources import Source, list_sources, source_facts
 
 _BATCH = 2000
@@ -51,6 +62,8 @@ _MOST_SWEPT = 65_536
 """Rows of a Parquet file of a sweep; one with more is none."""
 _FAULTS = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
 """What values of other kinds than a result's end in."""
+_LONGEST_FAULT = 1000
+"""Characters of DuckDB's message, which repeats the query."""
 _REMOTE_THREADS = 16
 STILL_S = 300.0
 """How long the processes that analyse may compute nothing [s]; a network drive that comes back does
@@ -136,28 +149,43 @@ class Catalog:
     def sql(self, query: str) -> Any:
         """Run a query in DuckDB over the views ``sessions``, ``analyses``, ``joints``, ``catalog``.
 
+        It runs in a process of its own (:mod:`.queries`), which reads nothing but the catalogue and
+        writes nothing.
+
         Returns:
             A ``pandas.DataFrame``.
 
         Raises:
-            UsageError: If DuckDB can't run it.
+            UsageError: If DuckDB can't run it, or it takes too much memory or time.
             DamagedFileError: If a file of the catalogue is damaged; a scan sets it aside.
             MissingExtraError: If DuckDB is not installed.
         """
+        check_installed()
+        return query_process().run(self.where, query)
+
+    def sql_here(self, query: str) -> Any:
+        """Run a query in this process, without its limits; see :meth:`sql`."""
         return settled(lambda: self._sql(query))
 
     def _sql(self, query: str) -> Any:
         import duckdb
 
-        with self._files.database() as database:
+        kinds = duckdb.StatementType
+        with self._files.database(bounded=True) as database:
             try:
-                return database.execute(query).df()
+                given = duckdb.extract_statements(query)
+                read = (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)  # MULTI is a pivot
+                if len(given) != 1 or given[0].type not in read:
+                    raise UsageError("DuckDB: give one query or condition that only reads")
+                return database.execute(given[0]).df()
+            except duckdb.OutOfMemoryException as error:
+                raise UsageError(f"DuckDB: {TOO_LARGE}") from error
             except duckdb.IOException as error:
                 if "No files found" in str(error) or "Cannot open file" in str(error):
                     raise FileNotFoundError(str(error)) from error
                 raise UsageError(f"DuckDB: {error}") from error
-            except duckdb.Error as error:
-                raise UsageError(f"DuckDB: {error}") from error
+            except (duckdb.Error, RuntimeError) as error:
+                raise UsageError(f"DuckDB: {str(error)[:_LONGEST_FAULT]}") from error
 
     # -- writing ---------------------------------------------------------------------------------
 
@@ -261,7 +289,7 @@ class Catalog:
         """
         stop = stop or StopRequest()
         query = "select path from catalog where status = 'not analysed' and damage is null"
-        missing: Sequence[str] = self.sql(query)["path"].to_list() if names is None else names
+        missing: Sequence[str] = self.sql_here(query)["path"].to_list() if names is None else names
         faults: dict[str, str] = {}
         for done, (name, outcome) in enumerate(self._analysed(missing, workers, stop), start=1):
             on_done(done, len(missing))

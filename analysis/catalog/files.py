@@ -174,7 +174,7 @@ class CatalogFiles:
         stem = f"{FOLDER}/{kind}/{prefix}{time.time_ns()}-{uuid.uuid4().hex[:8]}"
         self._whole.add(self._store.write_table(stem, table))
 
-    def database(self) -> AbstractContextManager[Any]:
+    def database(self, *, bounded: bool = False) -> AbstractContextManager[Any]:
         """Open the rows in DuckDB; see :func:`.rows.connect`."""
         base: dict[str, list[str]] = {}
         new: dict[str, list[str]] = {}
@@ -182,7 +182,7 @@ class CatalogFiles:
             names = self.names(kind)
             base[kind] = [name for name in names if _is_base(name)][-1:]
             new[kind] = [name for name in names if name not in base[kind]]
-        return connect(self._store, base, new)
+        return connect(self._store, base, new, bounded=bounded)
 
     def put_together(self) -> None:
         """Put many small files into one; on an object store they stay as they are.

@@ -7,9 +7,10 @@ Angles are in rad, energies in J, times in s. ``NAME_low`` and ``NAME_high`` are
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, TypeAlias
 
 import pyarrow as pa
 
@@ -235,7 +236,19 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
     ]
 
 
-_MEMORY = "800MB"
+_Config: TypeAlias = dict[str, str | bool | int | float | list[str]]
+_CONFIG: _Config = {"memory_limit": "800MB", "autoinstall_known_extensions": "false"}
+_BOUNDED: _Config = {
+    **_CONFIG,
+    "memory_limit": "500MB",
+    "temp_directory": "",  # nothing is written beside the catalogue
+    "autoload_known_extensions": "false",
+}
+_CLOSED = (
+    "python_enable_replacements = false",
+    "enable_external_access = false",
+    "lock_configuration = true",
+)
 
 # The base holds one row of each source (and joint), the other rows are few: only these are sorted.
 _CURRENT = """
@@ -308,7 +321,11 @@ _OWN = """
 
 @contextmanager
 def connect(
-    store: ObjectStore, base: Mapping[str, Sequence[str]], new: Mapping[str, Sequence[str]]
+    store: ObjectStore,
+    base: Mapping[str, Sequence[str]],
+    new: Mapping[str, Sequence[str]],
+    *,
+    bounded: bool = False,
 ) -> Generator[Any]:
     """Open a database in memory with the views of a catalogue.
 
@@ -318,17 +335,15 @@ def connect(
     Args:
         base: Kind of row to the Parquet file that :func:`put_together` made, or none.
         new: Kind of row to the names of its other Parquet files.
+        bounded: For a query of any origin: nothing but the views can be read, nothing written.
 
     Raises:
         MissingExtraError: If DuckDB is not installed.
     """
-    try:
-        import duckdb
-    except ImportError as error:
-        raise MissingExtraError("catalog", "catalog", "duckdb") from error
-    database: Any = duckdb.connect(
-        config={"memory_limit": _MEMORY, "autoinstall_known_extensions": "false"}
-    )
+    check_installed()
+    import duckdb
+
+    database: Any = duckdb.connect(config=_BOUNDED if bounded else _CONFIG)
     try:
         database.execute("set TimeZone = 'UTC'")
         for kind in SCHEMAS:
@@ -349,9 +364,34 @@ def connect(
             _JOINTS.format(own=_OWN),
         ):
             database.execute(statement)
+        if bounded:
+            _close_off(database, store, [*base.values(), *new.values()])
         yield database
     finally:
         database.close()
+
+
+def check_installed() -> None:
+    """Check that DuckDB is there.
+
+    Raises:
+        MissingExtraError: If it is not.
+    """
+    if find_spec("duckdb") is None:
+        raise MissingExtraError("catalog", "catalog", "duckdb")
+
+
+def _close_off(database: Any, store: ObjectStore, names: Iterable[Sequence[str]]) -> None:
+    """Leave a database nothing to read or write but the files of its views."""
+    if store.is_local:
+        paths = ", ".join(_quoted(store.path(name)) for part in names for name in part)
+        database.execute(f"set allowed_paths = [{paths}]")
+    for setting in _CLOSED:
+        database.execute(f"set {setting}")
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
 
 
 def put_together(database: Any, kind: str) -> Any:
@@ -370,7 +410,7 @@ def _open_rows(
 ) -> None:
     """Make rows a view of the database; local ones are read when needed."""
     if names and store.is_local:
-        paths = ", ".join("'" + store.path(name).replace("'", "''") + "'" for name in names)
+        paths = ", ".join(_quoted(store.path(name)) for name in names)
         database.execute(
             f"create temp view {view} as select * from read_parquet([{paths}], union_by_name=true)"  # noqa: S608
         )

@@ -41,14 +41,26 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.config import Count, Positive, read_fields
 from undulog.capture.common.errors import Fault, PlanError
 from undulog.capture.common.files import read_input
-from undulog.capture.common.strict_table import Faults, Table, at_least
+from undulog.capture.common.strict_table import Faults, Table, at_least, shown
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.sim.scenario.scenario import Kernels
 
 MOST_RUNS = 1_000_000
-
+"""Runs of a plan; all of them and their keys are held in memory."""
+_MOST_PARAMETERS = 100
+"""Parameters of a plan; SciPy's Sobol' sequence has 21,201 dimensions."""
+_MOST_CHARACTERS = 1_000_000_000
+"""Of the parameters of all runs, as text: each run's key is a hash of them."""
+_LONGEST_VALUE = 1000
+"""Characters of one value, as text."""
+_LONGEST_NAME = 1000
+"""Characters of a key or of the scenario's name."""
 
 _ANALYSIS = Options()
+
+
+_NUMBER = 24
+"""Characters of a double, as text."""
 
 
 class Design(StrEnum):
@@ -78,6 +90,11 @@ class Parameter:
     high: float = math.nan
     log: bool = False
     integer: bool = False
+
+    @property
+    def longest(self) -> int:
+        """Characters of the longest value, as text."""
+        return max((len(_as_text(value)) for value in self.values), default=_NUMBER)
 
     def at(self, share: float) -> Any:
         """Return the value at a share of the range, or of the list.
@@ -147,12 +164,26 @@ def read_plan(path: Path) -> SweepPlan:
     top = Table(values, "", faults)
     plan = read_fields(top, SweepPlan, parameters=lambda: _parameters(top))
     top.close()
-    runs = (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
-    if runs > MOST_RUNS:
-        top.fault("points", f"at most {MOST_RUNS} runs", str(runs))
+    if len(plan.scenario) > _LONGEST_NAME or not plan.scenario.isprintable():
+        top.fault("scenario", f"a name or path of at most {_LONGEST_NAME} printed characters")
+    _check_size(top, plan)
     if found := faults.all():
         raise PlanError(path, found)
     return plan
+
+
+def _check_size(top: Table, plan: SweepPlan) -> None:
+    """Note a plan whose runs no computer would hold or end."""
+    if len(plan.parameters) > _MOST_PARAMETERS:
+        return  # noted before
+    runs = (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
+    if runs > MOST_RUNS:
+        top.fault("points", f"at most {MOST_RUNS} runs", f"{runs:.3g}")
+        return
+    longest = sum(len(one.key) + one.longest for one in plan.parameters)
+    if runs * longest > _MOST_CHARACTERS:
+        valid = f"runs and parameters that take at most {_MOST_CHARACTERS} characters as text"
+        top.fault("points", valid, f"{runs} runs of {longest} characters")
 
 
 def _parameters(top: Table) -> tuple[Parameter, ...]:
@@ -161,7 +192,11 @@ def _parameters(top: Table) -> tuple[Parameter, ...]:
         top.fault(name, 'a table a parameter, e.g. [parameters."servo.stall_torque"]')
         return ()
     table = top.table("parameters")
-    found = tuple(_parameter(key, table.table(key)) for key in cast("dict[str, Any]", value))
+    names = list(cast("dict[str, Any]", value))
+    if len(names) > _MOST_PARAMETERS:
+        top.fault(name, f"at most {_MOST_PARAMETERS} parameters", str(len(names)))
+        return ()
+    found = tuple(_parameter(key, table.table(key)) for key in names)
     if "seed" in value:
         table.fault("seed", "left out: seeds and first_seed say it")
     table.close()
@@ -174,8 +209,18 @@ def _parameter(key: str, table: Table) -> Parameter:
         if not isinstance(values, list) or not values:
             table.fault("values", "a list of at least one value")
             values = [0.0]
+        listed = cast("list[Any]", values)
+        for number, entry in enumerate(listed):
+            if table.faults.full:
+                break
+            if not _is_value(entry):
+                valid = "a finite number, a text, true, false, or a list or table of them"
+                table.faults.add(f"{table.key('values')}[{number}]", shown(entry), valid)
+            elif len(_as_text(entry)) > _LONGEST_VALUE:
+                valid = f"at most {_LONGEST_VALUE} characters"
+                table.faults.add(f"{table.key('values')}[{number}]", shown(entry), valid)
         table.close()
-        return Parameter(key, tuple(cast("list[Any]", values)))
+        return Parameter(key, tuple(listed))
     low, high = table.number("low"), table.number("high")
     one = Parameter(
         key, (), low, high, table.flag("log", default=False), table.flag("integer", default=False)
@@ -186,6 +231,21 @@ def _parameter(key: str, table: Table) -> Parameter:
         table.fault("low", "above 0, since log is true")
     table.close()
     return one
+
+
+def _is_value(value: object) -> bool:
+    """Whether a TOML value is one that JSON has, so neither a date nor NaN or infinity."""
+    if isinstance(value, dict):
+        return all(map(_is_value, cast("dict[str, object]", value).values()))
+    if isinstance(value, list):
+        return all(map(_is_value, cast("list[object]", value)))
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return isinstance(value, bool | int | str)
+
+
+def _as_text(value: Any) -> str:
+    return value if isinstance(value, str) else str(value)
 
 
 def points_of(plan: SweepPlan) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from undulog.capture.common.files import is_file
 from undulog.capture.common.process import StopRequest
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import load_robot, robot_names
@@ -130,7 +131,7 @@ def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
             points that don't fit become failed rows.
     """
     beside = folder / plan.scenario
-    found = scenario_text(beside if beside.is_file() else plan.scenario)
+    found = scenario_text(beside if is_file(beside) else plan.scenario)
     address = output if "://" in output else str(Path(output).resolve())
     setting = Setting(
         scenario=found.text,
@@ -278,9 +279,9 @@ def _robots(plan: SweepPlan, scenario: str, folder: Path) -> dict[str, RobotText
         names.append(read_toml(scenario).get("robot"))
     names += [value for one in plan.parameters if one.key == "robot" for value in one.values]
     found: dict[str, RobotText] = {}
-    for name in map(str, names):
+    for name in dict.fromkeys(map(str, names)):
         shipped = name in robot_names()
-        if shipped or (folder / name).is_file():
+        if shipped or is_file(folder / name):
             robot = load_robot(name if shipped else folder / name)
             found[name] = RobotText(robot.toml, dict(robot.databases))
     return found

@@ -32,7 +32,7 @@ COLUMNS = ["path", "session_id", "messages", "status"]
 # -- what is damaged -------------------------------------------------------------------------------
 
 
-def _sweep_base(stage):
+def sweep_base(stage):
     """Make a sweep once: five rows of it in two files, one pending."""
     software()  # kept by the processes that are forked from this one
     folder = stage.folder / "bases" / "sweep"
@@ -49,7 +49,7 @@ def _sweep_base(stage):
     return folder
 
 
-def _catalog_base(stage):
+def catalog_base(stage):
     """Make a catalogue once: of two scans, with a result and a session that was removed."""
     folder = stage.folder / "bases" / "lab"
     if not folder.exists():
@@ -218,8 +218,8 @@ def _damage(rng, paths):
 
 
 def _run_sweep(rng, folder, stage):
-    shutil.copytree(_sweep_base(stage), folder, dirs_exist_ok=True)
-    expected = comparable(_rows_by_pyarrow(_sweep_base(stage) / "out"))
+    shutil.copytree(sweep_base(stage), folder, dirs_exist_ok=True)
+    expected = comparable(_rows_by_pyarrow(sweep_base(stage) / "out"))
     early = rng.random() < 0.25
     if early:
         _without_checksums(folder / "out")
@@ -259,7 +259,7 @@ def _rows_by_pyarrow(output):
 
 
 def _run_catalog(rng, folder, stage):
-    base = _catalog_base(stage)
+    base = catalog_base(stage)
     shutil.copytree(base, folder, dirs_exist_ok=True)
     catalogue = folder / "lab" / ".undulog-catalog"
     early = rng.random() < 0.25

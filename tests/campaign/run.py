@@ -35,6 +35,7 @@ from . import (
     marks,
     results,
     servers,
+    texts,
 )
 from .case import Result
 from .fuzz import kind_of, minimise, run_seed
@@ -88,13 +89,14 @@ PARTS = {
     "results": Part(results.run, 2_000, 15),
     "marks": Part(marks.run, 100, 3),
     "line_recorder": Part(line_recorder.run, 20, 2),
+    "texts": Part(texts.run, 2_000, 15),
     "tables": Part(partial(mutated, part="tables"), 3_000, 20),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 20),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 20),
     "bags": Part(partial(mutated, part="bags"), 3_000, 20),
     "binary": Part(partial(mutated, part="binary"), 4_500, 20),
     "serial": Part(partial(mutated, part="serial"), 2_000, 20),
-    "mutated": Part(mutated, 24_994, 120),
+    "mutated": Part(mutated, 22_994, 120),
 }
 LONG = sum(part.long for part in PARTS.values())
 

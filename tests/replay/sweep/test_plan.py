@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+import undulog as front
 from support.sweep_plans import write_plan
 from undulog.capture.common.errors import PlanError
 from undulog.replay.sweep.plan import Design, Parameter, SweepPlan, points_of, read_plan, runs_of
@@ -89,3 +90,82 @@ def test_the_plan_of_the_manual_is_one(tmp_path):
     path.write_text(page.split("```toml\n")[1].split("```")[0])
     sweep = prepare(read_plan(path), tmp_path, str(tmp_path / "strength"))
     assert (len(sweep.jobs), sweep.simulated_s) == (16, 16.0)
+
+
+PARAMETER = 'scenario = "flat"\n[parameters."servo.stall_torque"]\n'
+HOSTILE = {
+    "a range of a billion points": (
+        (
+            'scenario = "flat"\ndesign = "random"\npoints = 1000000000\n'
+            "[parameters.x]\nlow = 0\nhigh = 1\n"
+        ),
+        "at most 1000000 runs",
+    ),
+    "a grid of 10^12 runs": (
+        'scenario = "flat"\n'
+        + "".join(f"[parameters.x{k}]\nvalues = {list(range(1000))}\n" for k in range(4)),
+        "1000000 runs",
+    ),
+    "10^12 seeds": (
+        'scenario = "flat"\nseeds = 1000000000000\n[parameters.x]\nvalues = [1]\n',
+        "1000000 runs",
+    ),
+    "NaN": (PARAMETER + "values = [0.1, nan, 0.2]\n", r"values\[1\]: found nan"),
+    "infinity in a list": (PARAMETER + "values = [0.1, [inf], 0.2]\n", "finite number"),
+    "a date": (PARAMETER + "values = [0.1, 1979-05-27, 0.2]\n", "finite number"),
+    "a long text": (PARAMETER + f'values = [0.1, "{"x" * 1_000_000}", 0.2]\n', "1000 characters"),
+    "a falling range": (
+        ('scenario = "flat"\ndesign = "sobol"\npoints = 2\n[parameters.x]\nlow = 2\nhigh = 1\n'),
+        "above low",
+    ),
+    "a range from NaN": (
+        (
+            'scenario = "flat"\ndesign = "sobol"\npoints = 2\n[parameters.x]\n'
+            "low = nan\nhigh = inf\n"
+        ),
+        "finite number",
+    ),
+    "more parameters than dimensions": (
+        'scenario = "flat"\ndesign = "sobol"\npoints = 2\n'
+        + "".join(f"[parameters.x{k}]\nlow = 0\nhigh = 1\n" for k in range(22_000)),
+        "at most 100 parameters",
+    ),
+    "many runs of long texts": (
+        (
+            'scenario = "flat"\nseeds = 1000000\n[parameters.x]\n'
+            f'values = ["{"x" * 999}"]\n[parameters.y]\nvalues = ["{"x" * 999}"]\n'
+        ),
+        "characters as text",
+    ),
+    "a long name": (f'scenario = "{"x" * 100_000}"\n[parameters.x]\nvalues = [1]\n', "scenario"),
+    "a name with NUL": ('scenario = "a\\u0000.toml"\n[parameters.x]\nvalues = [1]\n', "scenario"),
+    "a hundred thousand unknown keys": (
+        'scenario = "flat"\n' + "".join(f"k{k} = 1\n" for k in range(100_000)),
+        "an unknown key",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_plans_that_no_computer_would_end_are_refused_by_a_sentence(name, tmp_path):
+    text, why = HOSTILE[name]
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(PlanError, match=why) as refused:
+        read_plan(tmp_path / "plan.toml")
+    assert len(str(refused.value)) < 100_000
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "../" * 300 + "x", "x\\u0000y", "a/" * 400 + "b.toml"])
+def test_names_of_robots_and_scenarios_that_no_file_has_are_refused(name, tmp_path, capsys):
+    plan = write_plan(tmp_path)
+    head = plan.read_text()
+    for text in (
+        head.replace('"wave.toml"', f'"{name}"'),
+        head + f'[parameters.robot]\nvalues = ["{name}"]\n',
+    ):
+        plan.write_text(text)
+        assert front.run(["sweep", str(plan), "-o", str(tmp_path / "rows"), "--dry-run"]) in (1, 2)
+        shown = capsys.readouterr().err
+        assert "Traceback" not in shown
+        assert len(shown) < 10_000
+    assert not (tmp_path / "rows").exists()

@@ -1,0 +1,191 @@
+"""Queries of a catalogue in a process of their own, with limits of memory and processor time.
+
+A query is text of any origin. DuckDB bounds what it sorts and joins, but not single values
+(``repeat('x', 2000000000)``), and can't be interrupted in them; so the operating system bounds the
+process. In it nothing but the catalogue's files can be read, and nothing written.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+from undulog.capture.common import errors
+from undulog.capture.common.errors import InputFileError, UndulogError, UsageError
+
+_CPU_S = 15
+"""Processor time of a query [s]; one over a million sessions takes less than one."""
+_ROOM = 1000 << 20
+"""Address space beyond what the process takes at its start [byte]; a database takes 400 MB of it
+without using them."""
+_LONGEST = 100_000
+"""Characters of a query."""
+_PROGRAM = f"import sys; from {__name__} import main; main(int(sys.argv[1]))"
+"""Of the process; run as a module, its classes would be those of another module."""
+TOO_LARGE = "the query takes too much memory; ask for fewer rows or columns"
+_TOO_LONG = f"the query takes over {_CPU_S} s of processor time; make it simpler"
+
+
+@dataclass(frozen=True)
+class _Refused:
+    """An error of the process, which as such can't travel between processes.
+
+    Attributes:
+        kind: Name of its class.
+        path: Of the file that it is about, or empty.
+    """
+
+    kind: str
+    path: str
+    text: str
+
+    def error(self) -> UndulogError:
+        """Return it as it was raised, as far as a caller tells errors apart."""
+        kind: Any = getattr(errors, self.kind, UndulogError)
+        if issubclass(kind, InputFileError):
+            return kind(self.path, self.text.removeprefix(f"{self.path}: "))
+        return UsageError(self.text) if issubclass(kind, UsageError) else UndulogError(self.text)
+
+
+class QueryProcess:
+    """The process that runs queries; one for this process, started with the first query."""
+
+    def __init__(self) -> None:
+        """Start none yet."""
+        self._lock = Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+
+    def run(self, where: str, query: str) -> Any:
+        """Run a query over a catalogue.
+
+        Args:
+            where: The catalogue's folder or URL.
+
+        Returns:
+            A ``pandas.DataFrame``.
+
+        Raises:
+            UsageError: If it isn't one query, DuckDB can't run it, or it takes too much memory or
+                time.
+            UndulogError: As :meth:`.catalog.Catalog.sql`.
+        """
+        if len(query) > _LONGEST:
+            raise UsageError(f"DuckDB: a query of {len(query)} characters, over {_LONGEST}")
+        with self._lock:
+            answer = self._ask(pickle.dumps((where, query)))
+        if isinstance(answer, _Refused):
+            raise answer.error()
+        return answer
+
+    def end(self) -> None:
+        """End the process; another one starts with the next query."""
+        self._end()
+
+    def _ask(self, request: bytes) -> Any:
+        connection, whole = self._connection or self._start(), False
+        try:
+            connection.send_bytes(request)
+            answer = connection.recv_bytes()
+            whole = True
+        except (EOFError, OSError):
+            return _Refused(UsageError.__name__, "", f"DuckDB: {self._end()}")
+        finally:
+            if not whole:  # also where the user ends it
+                self._end()
+        return pickle.loads(answer)  # noqa: S301  of our own process
+
+    def _start(self) -> Connection:
+        connection, other = Pipe()
+        self._connection = connection
+        with other:
+            self._process = subprocess.Popen(  # noqa: S603  our own arguments
+                [sys.executable, "-P", "-c", _PROGRAM, str(other.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,  # of a process that a limit ended
+                pass_fds=[other.fileno()],
+                process_group=0,  # a Ctrl-C ends it through us
+            )
+        return connection
+
+    def _end(self) -> str:
+        """End the process; return why it has ended, if it had."""
+        connection, process = self._connection, self._process
+        self._connection = self._process = None
+        if connection is not None:
+            connection.close()
+        if process is None:
+            return TOO_LARGE
+        try:
+            code = process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        return _TOO_LONG if code == -signal.SIGXCPU else TOO_LARGE
+
+
+@cache
+def query_process() -> QueryProcess:
+    """Return the process that runs the queries of this process."""
+    process = QueryProcess()
+    atexit.register(process.end)
+    return process
+
+
+def main(handle: int) -> None:
+    """Run the queries that come over a connection, until it ends."""
+    import duckdb
+
+    from .catalog import Catalog
+
+    duckdb.execute("select 1").df()  # imports what the limits needn't hold
+    _limit_memory()
+    connection = Connection(handle)
+    catalogs: dict[str, Catalog] = {}
+    while True:
+        try:
+            where, query = pickle.loads(connection.recv_bytes())  # noqa: S301  of our own process
+        except (EOFError, OSError):
+            return
+        answer: Any
+        try:
+            if where not in catalogs:
+                catalogs[where] = Catalog(where)
+            _limit_time()
+            answer = catalogs[where].sql_here(query)
+            packed = pickle.dumps(answer, protocol=5)
+        except MemoryError:
+            packed = pickle.dumps(_Refused(UsageError.__name__, "", f"DuckDB: {TOO_LARGE}"))
+        except UndulogError as error:
+            path = str(getattr(error, "path", ""))
+            packed = pickle.dumps(_Refused(type(error).__name__, path, str(error)))
+        connection.send_bytes(packed)
+
+
+def _limit_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    size = pages * resource.getpagesize() + _ROOM
+    most = resource.getrlimit(resource.RLIMIT_AS)[1]
+    size = size if most == resource.RLIM_INFINITY else min(size, most)
+    resource.setrlimit(resource.RLIMIT_AS, (size, size))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _limit_time() -> None:
+    used = os.times()
+    until = int(used.user + used.system) + 1 + _CPU_S
+    most = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    until = until if most == resource.RLIM_INFINITY else min(until, most)
+    resource.setrlimit(resource.RLIMIT_CPU, (until, most))
