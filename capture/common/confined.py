@@ -356,7 +356,7 @@ def _command(channel: int, alive: int) -> list[str]:
     everywhere.
     """
     if not sys.executable:
-        raise OSError("no interpreter is known (sys.executable)")
+        raise OSError("the path of the interpreter is not set (sys.executable)")
     root = str(Path(sys.modules[__name__.partition(".")[0]].__path__[0]).parent)
     modules = [str(Path(entry).absolute()) for entry in sys.path]
     flags = ["-I", "-S", "-W", "ignore", *(["-B"] if sys.dont_write_bytecode else [])]

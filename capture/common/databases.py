@@ -68,8 +68,10 @@ def _check_plain(base: sqlite3.Connection, table: str) -> None:
     columns = base.execute("SELECT hidden FROM pragma_table_xinfo(?)", (table,))
     if any(hidden for (hidden,) in columns):
         raise DatabaseError(f"table {table} has computed columns")
-    own = base.execute("SELECT sql FROM sqlite_master WHERE tbl_name = ? COLLATE NOCASE", (table,))
-    if any("check" in str(sql).lower() for (sql,) in own):
+    statements = base.execute(
+        "SELECT sql FROM sqlite_master WHERE tbl_name = ? COLLATE NOCASE", (table,)
+    )
+    if any("check" in str(sql).lower() for (sql,) in statements):
         raise DatabaseError(f"table {table} has a check to be computed")
     indices = base.execute("SELECT name, partial FROM pragma_index_list(?)", (table,)).fetchall()
     for index, partial in indices:

@@ -38,7 +38,7 @@ class Stage:
         self.bases = make_bases(folder / "bases", self.result_of)
         self.bases += foreign_bases(folder / "bases" / "foreign")
         bags = bag_bases(folder / "bases" / "bags")
-        database = next(one for one in bags if one.name == "bare.db3")
+        database = next(base for base in bags if base.name == "bare.db3")
         self.bases += bags
         self.bases += binary_bases(folder / "bases" / "binary", database.files["bare.db3"])
         self.warm_failures = self._warm()

@@ -52,8 +52,10 @@ def is_alive(number):
 
 def children():
     """Processes that this one has started, ended ones that it has not awaited among them."""
-    own = f"/proc/{os.getpid()}/task"
-    return [pid for task in Path(own).iterdir() for pid in (task / "children").read_text().split()]
+    folder = f"/proc/{os.getpid()}/task"
+    return [
+        pid for task in Path(folder).iterdir() for pid in (task / "children").read_text().split()
+    ]
 
 
 def test_facts_and_arrays_come_as_they_were_sent(reader, path):

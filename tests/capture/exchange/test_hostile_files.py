@@ -50,13 +50,13 @@ def test_every_type_that_an_element_of_a_mat_file_may_state(tmp_path):
     data = bytearray(whole.getvalue())
     numbers = bytes(struct.pack("<II", 9, 8 * len(T)))  # miDOUBLE
     place = data.index(numbers)
-    said = set()
+    reported = set()
     for kind in (0, 8, 10, 11, 14, 15, 16, 255):
         data[place] = kind
         path = tmp_path / f"kind{kind}.mat"
         path.write_bytes(data)
-        said.add(refused(path, *imported(path)).partition(".mat: ")[2])
-    assert any("was ended by SIGSEGV" in text for text in said)
+        reported.add(refused(path, *imported(path)).partition(".mat: ")[2])
+    assert any("was ended by SIGSEGV" in text for text in reported)
 
 
 def test_a_mat_file_that_declares_more_than_it_is_worth(tmp_path):
@@ -222,8 +222,8 @@ def test_frames_that_are_computed(data, tmp_path):
             f"INSERT INTO messages({kept}) SELECT {kept} FROM old; DROP TABLE old; VACUUM;"
         )
     base.close()
-    said = refused(path, *imported(path), "-r", "arcsnake-joint")
-    assert "computed columns" in said
+    reported = refused(path, *imported(path), "-r", "arcsnake-joint")
+    assert "computed columns" in reported
 
 
 @pytest.mark.parametrize("kind", ["blf", "mf4", "db"])

@@ -81,8 +81,8 @@ def test_large_messages_without_an_index_are_not_sorted_on_disk(tmp_path, monkey
 def test_a_pipe_is_not_waited_for(suffix, verb, tmp_path, command):
     path = tmp_path / f"x{suffix}"
     os.mkfifo(path)
-    said = command(*verb, path, code=1).err
-    assert said == f"error: {path}: can't be opened: it is a named pipe, not a file\n"
+    reported = command(*verb, path, code=1).err
+    assert reported == f"error: {path}: can't be opened: it is a named pipe, not a file\n"
 
 
 def test_neither_are_sockets_and_devices(tmp_path):
