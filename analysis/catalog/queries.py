@@ -8,37 +8,31 @@ process. In it nothing but the catalogue's files can be read, and nothing writte
 from __future__ import annotations
 
 import atexit
-import os
 import pickle
-import resource
 import signal
 import subprocess
 import sys
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing.connection import Connection, Pipe
-from pathlib import Path
 from threading import Lock
 from typing import Any
 
 from undulog.capture.common import errors
 from undulog.capture.common.errors import InputFileError, UndulogError, UsageError
 
-_CPU_S = 15
+CPU_S = 15
 """Processor time of a query [s]; one over a million sessions takes less than one."""
-_ROOM = 1000 << 20
-"""Address space beyond what the process takes at its start [byte]; a database takes 400 MB of it
-without using them."""
 _LONGEST = 100_000
 """Characters of a query."""
-_PROGRAM = f"import sys; from {__name__} import main; main(int(sys.argv[1]))"
-"""Of the process; run as a module, its classes would be those of another module."""
+_PROGRAM = f"import sys; from {__package__}.query_child import main; main(int(sys.argv[1]))"
+"""Of the process: it imports this package anew, and so no state of this process."""
 TOO_LARGE = "the query takes too much memory; ask for fewer rows or columns"
-_TOO_LONG = f"the query takes over {_CPU_S} s of processor time; make it simpler"
+_TOO_LONG = f"the query takes over {CPU_S} s of processor time; make it simpler"
 
 
 @dataclass(frozen=True)
-class _Refused:
+class Refused:
     """An error of the process, which as such can't travel between processes.
 
     Attributes:
@@ -85,7 +79,7 @@ class QueryProcess:
             raise UsageError(f"DuckDB: a query of {len(query)} characters, over {_LONGEST}")
         with self._lock:
             answer = self._ask(pickle.dumps((where, query)))
-        if isinstance(answer, _Refused):
+        if isinstance(answer, Refused):
             raise answer.error()
         return answer
 
@@ -100,7 +94,7 @@ class QueryProcess:
             answer = connection.recv_bytes()
             whole = True
         except (EOFError, OSError):
-            return _Refused(UsageError.__name__, "", f"DuckDB: {self._end()}")
+            return Refused(UsageError.__name__, "", f"DuckDB: {self._end()}")
         finally:
             if not whole:  # also where the user ends it
                 self._end()
@@ -142,50 +136,3 @@ def query_process() -> QueryProcess:
     process = QueryProcess()
     atexit.register(process.end)
     return process
-
-
-def main(handle: int) -> None:
-    """Run the queries that come over a connection, until it ends."""
-    import duckdb
-
-    from .catalog import Catalog
-
-    duckdb.execute("select 1").df()  # imports what the limits needn't hold
-    _limit_memory()
-    connection = Connection(handle)
-    catalogs: dict[str, Catalog] = {}
-    while True:
-        try:
-            where, query = pickle.loads(connection.recv_bytes())  # noqa: S301  of our own process
-        except (EOFError, OSError):
-            return
-        answer: Any
-        try:
-            if where not in catalogs:
-                catalogs[where] = Catalog(where)
-            _limit_time()
-            answer = catalogs[where].sql_here(query)
-            packed = pickle.dumps(answer, protocol=5)
-        except MemoryError:
-            packed = pickle.dumps(_Refused(UsageError.__name__, "", f"DuckDB: {TOO_LARGE}"))
-        except UndulogError as error:
-            path = str(getattr(error, "path", ""))
-            packed = pickle.dumps(_Refused(type(error).__name__, path, str(error)))
-        connection.send_bytes(packed)
-
-
-def _limit_memory() -> None:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    size = pages * resource.getpagesize() + _ROOM
-    most = resource.getrlimit(resource.RLIMIT_AS)[1]
-    size = size if most == resource.RLIM_INFINITY else min(size, most)
-    resource.setrlimit(resource.RLIMIT_AS, (size, size))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def _limit_time() -> None:
-    used = os.times()
-    until = int(used.user + used.system) + 1 + _CPU_S
-    most = resource.getrlimit(resource.RLIMIT_CPU)[1]
-    until = until if most == resource.RLIM_INFINITY else min(until, most)
-    resource.setrlimit(resource.RLIMIT_CPU, (until, most))
