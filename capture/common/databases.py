@@ -6,6 +6,7 @@ the file, and a row of it may be as large and take as long as it likes. Only pla
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Generator, Iterable
 from contextlib import closing, contextmanager
@@ -15,16 +16,23 @@ _LEAST_LENGTH = 1 << 20
 """Bytes that a value may have in a small file."""
 
 
+_CHECK = re.compile(r"\bcheck\b", re.IGNORECASE)
+
+
 class DatabaseError(ValueError):
     """A database that is not what it should be."""
 
 
 @contextmanager
-def open_database(path: Path, tables: Iterable[str]) -> Generator[sqlite3.Connection]:
+def open_database(
+    path: Path, tables: Iterable[str], *, immutable: bool = True
+) -> Generator[sqlite3.Connection]:
     """Open a database to be read.
 
     Args:
         tables: Tables that it must have, and that are plain.
+        immutable: Whether to read the file alone, without the changes that a program which was
+            killed left beside it.
 
     Yields:
         The connection; texts that are not UTF-8 are read with replacements.
@@ -33,7 +41,7 @@ def open_database(path: Path, tables: Iterable[str]) -> Generator[sqlite3.Connec
         DatabaseError: If a table is missing or is no plain one.
         sqlite3.Error: If it is damaged.
     """
-    name = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+    name = f"{path.absolute().as_uri()}?mode=ro&immutable={int(immutable)}"
     with closing(sqlite3.connect(name, uri=True)) as base:
         base.text_factory = _readable
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, _LEAST_LENGTH))
@@ -71,7 +79,7 @@ def _check_plain(base: sqlite3.Connection, table: str) -> None:
     statements = base.execute(
         "SELECT sql FROM sqlite_master WHERE tbl_name = ? COLLATE NOCASE", (table,)
     )
-    if any("check" in str(sql).lower() for (sql,) in statements):
+    if any(_CHECK.search(str(sql)) for (sql,) in statements):
         raise DatabaseError(f"table {table} has a check to be computed")
     indices = base.execute("SELECT name, partial FROM pragma_index_list(?)", (table,)).fetchall()
     for index, partial in indices:

@@ -171,7 +171,7 @@ def _reader(path: Path, suffix: str) -> MessageReader:
 
 def _check_database(path: Path) -> None:
     """Refuse what isn't plain, and data that is a number: it would count as a number of bytes."""
-    with open_database(path, ["messages"]) as base:
+    with open_database(path, ["messages"], immutable=False) as base:
         check_pages(base)
         number = "typeof(data) IN ('integer', 'real')"
         count = base.execute(f"SELECT count(*) FROM messages WHERE {number}").fetchone()[0]  # noqa: S608

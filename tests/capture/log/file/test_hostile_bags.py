@@ -101,3 +101,15 @@ def test_a_pipe_in_a_folder_of_ros(tmp_path):
     os.mkfifo(tmp_path / "x.db3")
     with pytest.raises(LogError, match=r"named pipe|not there|no such file"):
         Session(tmp_path)
+
+
+def test_a_plain_database_is_read(tmp_path):
+    """Columns whose names only look like a rule, indices of columns, texts that are no UTF-8."""
+    path = database(
+        tmp_path / "x.db3", f"{MESSAGES}, data BLOB, checksum INTEGER, generated TEXT",
+        script="CREATE INDEX i ON messages(checksum DESC, timestamp); "
+        "UPDATE messages SET data = x'00', generated = CAST(x'ff' AS TEXT)",
+        rows=5,
+    )  # fmt: skip
+    with Session(path) as session:
+        assert session.channels["/joint_states"].count == 5
