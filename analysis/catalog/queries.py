@@ -8,6 +8,7 @@ process. In it nothing but the catalogue's files can be read, and nothing writte
 from __future__ import annotations
 
 import atexit
+import os
 import pickle
 import signal
 import subprocess
@@ -60,6 +61,7 @@ class QueryProcess:
         self._lock = Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
+        self._environment: dict[str, str] = {}
 
     def run(self, where: str, query: str) -> Any:
         """Run a query over a catalogue.
@@ -88,6 +90,8 @@ class QueryProcess:
         self._end()
 
     def _ask(self, request: bytes) -> Any:
+        if self._environment != os.environ:  # names of servers and keys may have changed
+            self._end()
         connection, whole = self._connection or self._start(), False
         try:
             connection.send_bytes(request)
@@ -102,7 +106,7 @@ class QueryProcess:
 
     def _start(self) -> Connection:
         connection, other = Pipe()
-        self._connection = connection
+        self._connection, self._environment = connection, dict(os.environ)
         with other:
             self._process = subprocess.Popen(  # noqa: S603  our own arguments
                 [sys.executable, "-P", "-c", _PROGRAM, str(other.fileno())],

@@ -16,6 +16,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -78,9 +79,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ImportFormatError: If it is damaged, of another version, or takes too much memory or time.
     """
-    reader = Confined(ImportFormatError)
-    packet = reader.call(f"{__name__}:parse", path)
-    reader.close()
+    with closing(Confined(ImportFormatError)) as reader:
+        packet = reader.call(f"{__name__}:parse", path)
     none = np.array(None)
     return {name: packet.arrays.get(name, none) for name in packet.facts["names"]}
 

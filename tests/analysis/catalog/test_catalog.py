@@ -24,6 +24,7 @@ from undulog.analysis.catalog.catalog import Catalog
 from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError, NotALogError, UsageError
+from undulog.capture.common.part_files import unfinished_path
 from undulog.capture.log.read.facts import MOST_REQUESTS, read_facts
 
 
@@ -193,9 +194,10 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
 def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     path = tmp_path / "run.mcap"
     killed_after([sys.executable, recorder.__file__, str(path), "{}"], 0.3)
-    path.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
+    part = unfinished_path(path)
+    part.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
     if left is not None:
-        path.write_bytes(left)
+        part.write_bytes(left)
     catalog = Catalog(str(tmp_path))
     assert (catalog.scan().damaged, Catalog(str(tmp_path)).scan().read) == (1, 0)
     (row,) = catalog.find().itertuples()
@@ -209,7 +211,7 @@ def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     assert catalog.scan().damaged == 1
     assert "no readable header" in catalog.find().damage[0]
     shutil.rmtree(tmp_path / "run.mcap.wal")
-    path.unlink(missing_ok=True)
+    part.unlink(missing_ok=True)
     assert catalog.scan().removed == 1
     assert not len(catalog.find())
 

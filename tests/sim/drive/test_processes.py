@@ -11,6 +11,7 @@ import pytest
 
 from support.processes import UNDULOG, process, serving, undulog, wait_for
 from undulog.capture import Session
+from undulog.capture.common.part_files import unfinished_path
 from undulog.capture.log.messages.frames import DIR_TX
 
 pytestmark = pytest.mark.slow
@@ -140,10 +141,11 @@ def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     path = tmp_path / "a.mcap"
+    part = unfinished_path(path)
     with served("flat", "--lockstep", "--fast") as (on, _):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
         with process(*UNDULOG, *words, env=alone) as driving:
-            wait_for(lambda: path.exists() and path.stat().st_size > 0, alive=[driving])
+            wait_for(lambda: part.exists() and part.stat().st_size > 0, alive=[driving])
             time.sleep(1.0)
             driving.send_signal(number)
             shown, complained = driving.communicate(timeout=60)
