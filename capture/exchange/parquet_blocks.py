@@ -123,7 +123,7 @@ def _batches(
     path: Path, columns: list[str] | None, rows: int, where: tuple[str, int] | None
 ) -> Iterator[Any]:
     parquet = arrow("a .parquet table")
-    with parquet.ParquetFile(path) as file:
+    with parquet.ParquetFile(path, pre_buffer=False) as file:
         names = Counter(cast("list[str]", file.schema_arrow.names))
         if columns is None and len(names) > WIDEST:
             refuse(path, f"has {len(names)} columns; {WIDEST} at most")
