@@ -85,8 +85,9 @@ class PauseWatch:
         """All so far."""
         self._continued, self._suspended = continued, suspended
         self._count, self._before_ns = continued(), suspended()
-        self._last_ns = now_ns
-        self._latest = 0, now_ns, now_ns  # the longest delay since the last call of `take`
+        self._last_ns, self._early = now_ns, 0
+        self._delays: list[tuple[int, int, int]] = []
+        """Since the last report: how long, from, to [ns]."""
         self._reported = 0
         self._dropped: dict[str, int | None] = {}
 
@@ -98,7 +99,8 @@ class PauseWatch:
             planned_ns: Part of the time since the last call that the loop meant to wait [ns].
         """
         delay_ns = now_ns - self._last_ns - planned_ns
-        self._latest = max(self._latest, (delay_ns, self._last_ns, now_ns))
+        if delay_ns >= _SHORTEST_NS:
+            self._delays.append((delay_ns, self._last_ns, now_ns))
         self._last_ns = now_ns
 
     def report(self, dropped: Mapping[str, int | None], *, ends: bool = False) -> tuple[str, ...]:
@@ -122,15 +124,25 @@ class PauseWatch:
         return tuple(f"{pause}; {losses}" for pause in open_pauses)
 
     def _find(self) -> None:
-        """Add the pause since the last call, if there was one."""
-        delay_ns, began_ns, ended_ns = self._latest
-        self._latest = 0, self._last_ns, self._last_ns
+        """Add the pauses since the last call.
+
+        Which delay a signal ended isn't known: the longest ones, as many as there were signals. A
+        stop after the last call of :meth:`look` has its signal counted before its delay.
+        """
+        delays, self._delays = sorted(self._delays, reverse=True), []
         count, total_ns = self._continued(), self._suspended()
-        by_signal, slept_ns = count != self._count, total_ns - self._before_ns
+        new, slept_ns = count - self._count, total_ns - self._before_ns
+        signals, self._early = new + self._early, 0
         self._count, self._before_ns = count, total_ns
-        slept_ns = slept_ns if slept_ns >= _SUSPENDED_NS else 0
-        if delay_ns >= (_SHORTEST_NS if by_signal else _UNEXPLAINED_NS) or slept_ns:
-            self.pauses.append(Pause(began_ns, ended_ns, slept_ns, by_signal))
+        if slept_ns >= _SUSPENDED_NS:
+            _, began_ns, ended_ns = delays[0] if delays else (0, self._last_ns, self._last_ns)
+            self.pauses.append(Pause(began_ns, ended_ns, slept_ns, by_signal=signals > 0))
+            return
+        stops = [Pause(began, ended, 0, by_signal=True) for _, began, ended in delays[:signals]]
+        self._early = min(new, signals - len(stops))
+        if not signals and delays and delays[0][0] >= _UNEXPLAINED_NS:
+            stops = [Pause(*delays[0][1:], 0, by_signal=False)]
+        self.pauses += sorted(stops, key=lambda pause: pause.began_ns)
 
 
 def _losses(before: Mapping[str, int | None], after: Mapping[str, int | None]) -> str:

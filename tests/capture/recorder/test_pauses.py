@@ -68,6 +68,31 @@ def test_two_stops_one_after_the_other_are_two_pauses():
     assert len(loop.watch.pauses) == len(loop.texts) == 2
 
 
+def test_two_stops_within_one_tick_are_two_pauses():
+    loop = Loop()
+    loop.tick()
+    for stop_ns, planned_ns in ((50 * MS, TICK_NS), (70 * MS, 0)):
+        loop.now_ns += planned_ns + stop_ns
+        loop.continued += 1
+        loop.watch.look(loop.now_ns, planned_ns)
+    loop.texts += loop.watch.report(NO_LOSS)
+    loop.settle()
+    first, second = loop.watch.pauses
+    assert first.ended_ns == second.began_ns == second.ended_ns - 70 * MS
+    assert len(loop.texts) == 2
+
+
+def test_a_stop_between_a_look_and_its_report_is_a_pause():
+    loop = Loop()
+    loop.tick()
+    loop.watch.look(loop.now_ns)
+    loop.continued += 1  # stopped here, for 50 ms
+    loop.watch.report(NO_LOSS)
+    loop.tick(50 * MS)
+    loop.settle()
+    assert len(loop.watch.pauses) == len(loop.texts) == 1
+
+
 def test_what_was_lost_is_counted_until_the_sources_have_settled():
     loop = Loop()
     loop.tick()
