@@ -75,14 +75,13 @@ def _stop_and_check(folder, stack, case, rng, result):
     )
     for sender in sending:
         sender.wait_for(200)
-    stops = 0
-    apart = 0
+    stops = apart = 0
     for _ in range(count):
         gap_s = rng.uniform(0.0, 0.8)
         time.sleep(gap_s)
         stop(running, stop_s, group=when == "group")
+        apart += not stops or gap_s > TICK_S
         stops += 1
-        apart += gap_s > TICK_S
         if when == "twice":
             stop(running, stop_s)
             stops += 1
