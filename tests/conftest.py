@@ -20,6 +20,7 @@ from hypothesis import settings
 settings.register_profile("undulog", deadline=None)  # no test is timed
 settings.load_profile("undulog")
 pytest.register_assert_rewrite("support")
+pytest_plugins = ["support.clock_tests"]
 
 # In the background of a script or under nohup these are ignored, and every process that a test
 # starts would inherit that. A handler is not inherited; this one goes on ignoring SIGHUP here.

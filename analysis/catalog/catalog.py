@@ -46,6 +46,7 @@ from .rows import (
     Row,
     check_installed,
     is_result,
+    raise_if_vanished,
     result_rows,
     session_row,
     sweep_rows,
@@ -181,8 +182,7 @@ class Catalog:
             except duckdb.OutOfMemoryException as error:
                 raise UsageError(f"DuckDB: {TOO_LARGE}") from error
             except duckdb.IOException as error:
-                if "No files found" in str(error) or "Cannot open file" in str(error):
-                    raise FileNotFoundError(str(error)) from error
+                raise_if_vanished(error)
                 raise UsageError(f"DuckDB: {error}") from error
             except (duckdb.Error, RuntimeError) as error:
                 raise UsageError(f"DuckDB: {str(error)[:_LONGEST_FAULT]}") from error

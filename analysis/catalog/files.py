@@ -60,7 +60,7 @@ def settled(read: Callable[[], _Value]) -> _Value:
         try:
             return read()
         except OSError as error:
-            if not isinstance(error.__cause__ or error, FileNotFoundError):
+            if not any(isinstance(e, FileNotFoundError) for e in (error, error.__cause__)):
                 raise
     return read()
 

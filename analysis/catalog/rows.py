@@ -338,6 +338,7 @@ def connect(
         bounded: For a query of any origin: nothing but the views can be read, nothing written.
 
     Raises:
+        FileNotFoundError: If a file is no longer there.
         MissingExtraError: If DuckDB is not installed.
     """
     check_installed()
@@ -345,30 +346,53 @@ def connect(
 
     database: Any = duckdb.connect(config=_BOUNDED if bounded else _CONFIG)
     try:
-        database.execute("set TimeZone = 'UTC'")
-        for kind in SCHEMAS:
-            _open_rows(database, store, f"{kind}_base", base[kind], kind)
-            _open_rows(database, store, f"{kind}_new", new[kind], kind)
-        for view, table, source in (
-            ("files", "sessions", "path"),
-            ("all_analyses", "analyses", "source"),
-            ("all_joints", "joints", "source"),
-        ):
-            database.execute(_CURRENT.format(view=view, table=table, source=source))
-        split = database.execute("select count(*) from files where part > 1").fetchone()[0]
-        for statement in (
-            _SPLIT_SESSIONS if split else _SESSIONS,
-            _AFFECTED,
-            _ANALYSES,
-            _CATALOG.format(own=_OWN),
-            _JOINTS.format(own=_OWN),
-        ):
-            database.execute(statement)
+        try:
+            _open_views(database, store, base, new)
+        except duckdb.IOException as error:
+            raise_if_vanished(error)
+            raise
         if bounded:
             _close_off(database, store, [*base.values(), *new.values()])
         yield database
     finally:
         database.close()
+
+
+def _open_views(
+    database: Any,
+    store: ObjectStore,
+    base: Mapping[str, Sequence[str]],
+    new: Mapping[str, Sequence[str]],
+) -> None:
+    database.execute("set TimeZone = 'UTC'")
+    for kind in SCHEMAS:
+        _open_rows(database, store, f"{kind}_base", base[kind], kind)
+        _open_rows(database, store, f"{kind}_new", new[kind], kind)
+    for view, table, source in (
+        ("files", "sessions", "path"),
+        ("all_analyses", "analyses", "source"),
+        ("all_joints", "joints", "source"),
+    ):
+        database.execute(_CURRENT.format(view=view, table=table, source=source))
+    split = database.execute("select count(*) from files where part > 1").fetchone()[0]
+    for statement in (
+        _SPLIT_SESSIONS if split else _SESSIONS,
+        _AFFECTED,
+        _ANALYSES,
+        _CATALOG.format(own=_OWN),
+        _JOINTS.format(own=_OWN),
+    ):
+        database.execute(statement)
+
+
+def raise_if_vanished(error: Exception) -> None:
+    """Raise an error of DuckDB as what it is where another process removed a file meanwhile.
+
+    Raises:
+        FileNotFoundError: If it is one.
+    """
+    if "No files found" in str(error) or "Cannot open file" in str(error):
+        raise FileNotFoundError(str(error)) from error
 
 
 def check_installed() -> None:

@@ -12,6 +12,7 @@ from support.analysed import analysed
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.written_sessions import write_session
 from undulog.analysis.catalog.catalog import Catalog
+from undulog.analysis.catalog.files import CatalogFiles
 from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture.common.errors import DamagedFileError
 
@@ -93,6 +94,20 @@ def test_a_damaged_file_is_set_aside_and_its_rows_are_read_again(lab, kind, dama
         assert (found["plain.mcap"] == "analysed") == (len(joints) > 0)
         assert Catalog(str(whole)).scan().set_aside == ()
         assert Catalog(str(whole)).scan().read == 0
+
+
+def test_a_file_that_vanishes_after_the_listing_is_listed_anew(lab, monkeypatch):
+    before = Catalog(str(lab)).find()
+    listed, stale = CatalogFiles.names, ["rows-1-another-process-removed-it.parquet"]
+
+    def names(self, kind):
+        gone = [f"{FOLDER}/{kind}/{stale.pop()}"] if stale and kind == "joints" else []
+        return listed(self, kind) + gone
+
+    monkeypatch.setattr(CatalogFiles, "names", names)
+    rows = Catalog(str(lab)).sql_here("select * from catalog order by path")
+    assert not stale
+    pd.testing.assert_frame_equal(rows, before)
 
 
 def test_a_scan_that_was_interrupted_leaves_the_damage_to_be_found(lab):
