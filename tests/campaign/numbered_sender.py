@@ -151,6 +151,17 @@ def main():
     sys.stdin.read()  # a connection that ends is another fault
 
 
+def never_late():
+    """Be a line of hardware as far as this computer allows it: no other program holds one up.
+
+    Servos' bytes that come late within a packet are a packet that was cut.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
+    except PermissionError:
+        return
+
+
 if __name__ == "__main__":
-    os.nice(-5) if os.geteuid() == 0 else None
+    never_late()
     main()
