@@ -53,6 +53,7 @@ LEVELS = 8
 _SWEPT = 0.97  # rank correlation of a sweep's instantaneous frequency with time
 _POWER = 1e-4  # of the strongest bin, smoothed: below it a bin isn't excited
 _SMOOTHING = 5  # bins
+_LONGEST = 16  # times the samples at the median interval: rates may change within a record
 
 
 class Kind(StrEnum):
@@ -86,9 +87,12 @@ def find_excitation(command: Series) -> Excitation | None:
         command: Its samples, without gaps.
 
     Returns:
-        None where it doesn't move or has fewer than :data:`LEAST_SAMPLES` samples.
+        None where it doesn't move, has fewer than :data:`LEAST_SAMPLES` samples, or has gaps after
+        all: longer ones than the time that it covers.
     """
     if command.count < LEAST_SAMPLES or np.ptp(command.values) == 0:
+        return None
+    if command.t_s[-1] - command.t_s[0] > _LONGEST * command.count * command.period_s:
         return None
     # At its own sampling interval, so that steps stay between the same samples of each period.
     even = resampled(command, np.arange(command.t_s[0], command.t_s[-1], command.period_s))
