@@ -1,7 +1,6 @@
 """What the tests of sources share: a recording, random bus traffic, and patience."""
 
 import socket
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages import frames as fr
+from undulog.capture.recorder.status import SessionClock
 from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
 
 
@@ -61,10 +61,9 @@ class Reader:
 @pytest.fixture
 def context(tmp_path):
     """A recording that has begun."""
-    epoch_ns, start_ns = time.time_ns(), time.monotonic_ns()
-    path = tmp_path / "session.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=epoch_ns) as writer:
-        yield SourceContext(lambda: epoch_ns + time.monotonic_ns() - start_ns, writer)
+    clock, path = SessionClock(), tmp_path / "session.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=clock.epoch_ns) as writer:
+        yield SourceContext(clock.now_ns, writer)
 
 
 @pytest.fixture

@@ -1,10 +1,12 @@
 """Recorders in processes of their own, and what tests send to them and read of them."""
 
 import json
+import os
 import socket
 import time
 from collections import Counter
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
@@ -13,6 +15,7 @@ from support.paths import ROOT
 from support.processes import UNDULOG, process, wait_for
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
+from undulog.capture.recorder.control_client import ControlClient
 
 
 def command(output, *arguments):
@@ -69,6 +72,21 @@ def greet(client, listening=b"< hi >"):
     for _ in range(2):
         client.recv(4096)
         client.sendall(b"< ok >")
+
+
+def sockets_of(pid):
+    """Return the open sockets of a process."""
+    return [
+        link
+        for one in Path(f"/proc/{pid}/fd").iterdir()
+        if (link := os.readlink(one)).startswith("socket:")  # noqa: PTH115
+    ]
+
+
+def status_of(output):
+    """Return the state of a recorder that :func:`recording` runs."""
+    with ControlClient(output.with_name("control.sock")) as client:
+        return client.ask({"do": "status"})
 
 
 def events(path):

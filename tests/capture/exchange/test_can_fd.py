@@ -344,6 +344,7 @@ def test_a_frame_too_short_for_its_signal_is_reported(tmp_path):
 # -- recording -----------------------------------------------------------------------------
 
 
+@pytest.mark.clock(0.02, "the device's clock has to run with this computer's for a mapping")
 def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
     database = cantools.database.load_string(BIG, "dbc")
     robot = bus_robot(BIG, SIGNALS)

@@ -189,8 +189,7 @@ def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path, 
         wait_for(bus.exists, "the source's socket")
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
             sender.connect(str(bus))
-            deadline = time.monotonic() + 120
-            while process.poll() is None and time.monotonic() < deadline:
+            while process.poll() is None:
                 frames["data"] = rng.integers(0, 256, frames["data"].shape)  # no compression
                 for start in range(0, len(frames), 250):
                     try:

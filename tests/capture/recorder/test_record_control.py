@@ -5,7 +5,6 @@ import functools
 import json
 import os
 import signal
-import subprocess
 import sys
 
 import pytest
@@ -14,7 +13,7 @@ from support import processes
 from support.processes import UNDULOG, python, wait_for
 from support.processes import undulog as undulog_command
 from support.read_back import decoded_of
-from support.recorders import connected_sender
+from support.recorders import connected_sender, sockets_of
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
 PATIENCE_S = 60.0
@@ -117,8 +116,7 @@ def test_a_recorder_that_is_killed_while_we_wait_is_reported(recorder):
     process = recorder("run")
     process.send_signal(signal.SIGSTOP)
     waiting = processes.start(*UNDULOG, "record", "stop", "--wait")
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        waiting.wait(1.0)
+    wait_for(lambda: sockets_of(waiting.pid), "its question")
     assert waiting.poll() is None, "it waits, however long the recorder hangs"
     process.kill()
     _, err = waiting.communicate(timeout=PATIENCE_S)

@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -82,7 +81,6 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first, tmp_path):
             greet(client)
             for start in range(0, len(lines), JOINTS):
                 client.sendall(b"".join(lines[start : start + JOINTS]))
-                time.sleep(0.004)
             client.recv(1)  # until the recorder leaves
 
     server = threading.Thread(target=serve)

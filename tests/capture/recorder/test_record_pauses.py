@@ -14,7 +14,7 @@ import pytest
 
 from campaign.interruptions import KINDS, run_case
 from support.processes import wait_for
-from support.recorders import ended, events, greet, recording
+from support.recorders import ended, events, greet, recording, status_of
 from support.written_frames import frames_of
 
 
@@ -59,6 +59,11 @@ def test_frames_that_waited_during_a_stop_have_the_time_of_their_arrival(tmp_pat
     assert report["recorder"]["pauses"] == "1"
 
 
+def is_as_expected(link, back):
+    """Whether a link is gone, or back with its second frame."""
+    return (link["connected"], link["frames"]) == (back, 1 + back)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("back", [False, True], ids=["gone", "back"])
 def test_a_lost_link_is_an_error_unless_it_came_back(back, tmp_path):
@@ -75,8 +80,7 @@ def test_a_lost_link_is_an_error_unless_it_came_back(back, tmp_path):
                 client.sendall(b"< frame 1 2.000000 11 >")
             else:
                 server.close()
-                time.sleep(1.0)
-            time.sleep(0.5)
+            wait_for(lambda: is_as_expected(status_of(output)["sources"][0], back), "the link")
             report, err = ended(recorder, signal.SIGTERM)
             with suppress(OSError):
                 client.close()

@@ -3,11 +3,10 @@
 import os
 import re
 import resource
-import time
 
 import pytest
 
-from support.processes import python
+from support.processes import python, wait_for
 from support.wal_messages import MESSAGE, check_messages, message
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.wal.reader import recover
@@ -28,14 +27,12 @@ def test_a_failing_disk_is_reported_by_the_next_append_and_by_close(tmp_path, mo
     monkeypatch.setattr(os, "fdatasync", broken)
     accepted = 1
 
-    def go_on():
+    def append_one():
         nonlocal accepted
-        for _ in range(10_000):
-            accepted = wal.append(*message(accepted + 1))
-            time.sleep(0.001)
+        accepted = wal.append(*message(accepted + 1))
 
     with pytest.raises(LogWriteError, match=r"seg: can't be brought to the disk: Input/output"):
-        go_on()
+        wait_for(append_one, "a sync")
     with pytest.raises(LogWriteError, match="Input/output error"):
         wal.close()
     monkeypatch.undo()
@@ -49,7 +46,7 @@ def test_a_dead_background_thread_is_reported_by_the_next_append(tmp_path, monke
 
     monkeypatch.setattr(WriteAheadLog, "_drop_released", broken)
     wal = WriteAheadLog(tmp_path / "w")
-    wal._thread.join(10)
+    wait_for(lambda: not wal._thread.is_alive(), "its end")
     with pytest.raises(LogWriteError, match=r"can't be looked after: RuntimeError\('unforeseen'\)"):
         wal.append(*message(1))
     monkeypatch.undo()
