@@ -216,14 +216,17 @@ class ArrivalClock:
     offset between them is only changed as far as a reading contradicts it.
     """
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, now_ns: Callable[[], int], wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         """Compare the clocks for the first time.
 
         Args:
             now_ns: The session's clock [Unix ns].
+            wall_ns: The kernel's clock of arrivals [Unix ns].
         """
-        self._now_ns = now_ns
-        readings = [(now_ns(), time.time_ns(), now_ns()) for _ in range(5)]
+        self._now_ns, self._wall_ns = now_ns, wall_ns
+        readings = [(now_ns(), wall_ns(), now_ns()) for _ in range(5)]
         before, wall, after = min(readings, key=lambda reading: reading[2] - reading[0])
         self._offset_ns = (before + after) // 2 - wall
 
@@ -240,7 +243,7 @@ class ArrivalClock:
         Returns:
             Arrival on the session's clock [Unix ns], in order, not after now.
         """
-        before, wall, after = self._now_ns(), time.time_ns(), self._now_ns()
+        before, wall, after = self._now_ns(), self._wall_ns(), self._now_ns()
         offset = self._offset_ns = min(max(self._offset_ns, before - wall), after - wall)
         times: list[int] = []
         latest = after

@@ -121,7 +121,9 @@ def test_processor_time_grows_with_work_alone():
         freeze(busy.pid)
         freeze(idle.pid)
         stopped = processor_time(pids)
-        time.sleep(0.3)
+        with python_started("while True: pass") as other:
+            wait_for(lambda: processor_time([other.pid])[0] > 20, "work of another process")
+            other.kill()
         assert processor_time(pids) == stopped
     finally:
         for process in (busy, idle):

@@ -2,7 +2,6 @@
 
 import socket
 import threading
-import time
 
 import pytest
 
@@ -86,7 +85,6 @@ def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen
         nonlocal sent
         theirs.send(FRAME)  # drops come with the next packet
         sent += 1
-        time.sleep(0.05)
         reader.poll()
 
     wait_for(lambda: len(reader.frames) + (reader.counts.dropped or 0) == sent, each=send_one)

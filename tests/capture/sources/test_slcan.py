@@ -5,7 +5,6 @@ import itertools
 import os
 import select
 import threading
-import time
 import tty
 
 import numpy as np
@@ -329,8 +328,8 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen):
     truth = traffic(1000)
     adapter = plug()
     bus = slcanBus(str(tmp_path / "ttyACM0"), bitrate=500_000, sleep_after_open=0, listen_only=True)
-    while adapter.commands.count(b"L") < 2:  # it opens twice; an answer must not split a frame
-        time.sleep(0.01)
+    # It opens twice; an answer must not split a frame.
+    wait_for(lambda: adapter.commands.count(b"L") >= 2, "both openings")
     adapter.send(stream(truth))
     _, frames = received(bus, len(truth))
     bus.shutdown()
@@ -351,8 +350,12 @@ def test_can_fd_frames_as_python_cans_own_client_writes_them(plug, tmp_path):
     for frame in truth:
         bus.send(can_message(frame, error_state_indicator=False))
     bus.shutdown()
-    while len(sent := [line for line in adapter.commands if line[:1] in b"dDbB"]) < len(truth):
-        time.sleep(0.01)
+
+    def lines():
+        return [line for line in adapter.commands if line[:1] in b"dDbB"]
+
+    wait_for(lambda: len(lines()) >= len(truth), "all frames")
+    sent = lines()
     tally = Tally(lambda: 0)
     _, found = SlcanText(stamps=False).feed(b"\r".join(sent) + b"\r", 5, tally)
     assert tally.counts.malformed == 0

@@ -5,21 +5,25 @@ the control messages with the time and the count of drops, is the same on any da
 frames are packed by python-can.
 """
 
+import itertools
 import socket
-import time
 
 import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
 from support.can_messages import can_message, fd_traffic, same, traffic
+from support.processes import wait_for
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FD_BRS, FD_ESI
+from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources import reader_thread
 from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcan import SocketcanLink, frames_of
+
+CLOCK = SessionClock()
 
 
 def packed(frame):
@@ -37,7 +41,7 @@ def pair(sockets):
 def test_twenty_thousand_frames_as_packed_by_python_can(pair):
     ours, theirs = pair
     truth = traffic(20_000)
-    tally = Tally(time.time_ns)
+    tally = Tally(CLOCK.now_ns)
     link = SocketcanLink(ours, tally)
     found = []
     for start in range(0, len(truth), 50):
@@ -57,7 +61,7 @@ def test_drops_are_those_that_the_kernel_counts(pair):
     ours, theirs = pair
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
     frame = packed(traffic(1)[0])
-    tally = Tally(time.time_ns)
+    tally = Tally(CLOCK.now_ns)
     link = SocketcanLink(ours, tally)
     got = 0
     for _ in range(3):
@@ -74,11 +78,11 @@ def test_drops_are_those_that_the_kernel_counts(pair):
 
 def test_arrival_is_the_kernels(pair):
     ours, theirs = pair
-    link = SocketcanLink(ours, Tally(time.time_ns))
-    before_ns = time.time_ns()
+    link = SocketcanLink(ours, Tally(CLOCK.now_ns))
+    before_ns = CLOCK.now_ns()
     theirs.send(packed(traffic(1)[0]))
-    after_ns = time.time_ns()
-    time.sleep(0.02)
+    after_ns = CLOCK.now_ns()
+    wait_for(lambda: CLOCK.now_ns() > after_ns + 20_000_000, "a later time")
     (frames,) = link.read(0)
     slack_ns = 1_000_000
     assert before_ns - slack_ns <= int(frames["t_host_ns"][0]) <= after_ns + slack_ns
@@ -89,7 +93,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair):
     ours, theirs = pair
     truth, fd_truth = traffic(2), fd_traffic(40)
     fd_truth["fd_flags"][::3] |= FD_ESI
-    tally = Tally(time.time_ns)
+    tally = Tally(CLOCK.now_ns)
     link = SocketcanLink(ours, tally)
     theirs.send(packed(truth[0]))
     for frame in fd_truth:
@@ -104,7 +108,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair):
     assert tally.counts.malformed == 3
     assert tally.events.flush()[0].text.startswith("packet that is no CAN frame")
     times = np.concatenate([frames["t_host_ns"], fd_frames["t_host_ns"]])
-    assert abs(time.time_ns() - int(times.min())) < 60_000_000_000
+    assert abs(CLOCK.now_ns() - int(times.min())) < 60_000_000_000
     assert frames["t_host_ns"][0] <= fd_frames["t_host_ns"].min()
     assert fd_frames["t_host_ns"].max() <= frames["t_host_ns"][1]
     link.close()
@@ -118,7 +122,7 @@ def test_frames_of_this_computer_are_marked():
 
 def test_a_socket_that_fails_is_a_lost_connection(pair):
     ours, _ = pair
-    link = SocketcanLink(ours, Tally(time.time_ns))
+    link = SocketcanLink(ours, Tally(CLOCK.now_ns))
     link.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         link.read(0)
@@ -138,14 +142,15 @@ def test_more_packets_than_fit_one_call(pair):
 
 
 def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known():
-    start_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+    elapsed = itertools.count(step=1000)  # of both clocks [ns]
+    session_ns, wall_ns, hour = 10**18, 17 * 10**17, 3600 * 10**9
 
     def now_ns():
-        return 10**18 + time.monotonic_ns() - start_ns
+        return session_ns + next(elapsed)
 
-    clock, now = reader_thread.ArrivalClock(now_ns), now_ns()
-    hour = 3600 * 10**9
-    stamps = [time.time_ns(), wall_ns + hour, wall_ns - hour, 0]
+    clock = reader_thread.ArrivalClock(now_ns, lambda: wall_ns + next(elapsed))
+    now = now_ns()
+    stamps = [wall_ns + next(elapsed), wall_ns + hour, wall_ns - hour, 0]
     for stamp in stamps:
         (t_ns,) = clock.times([stamp], now - 1_000_000)
         assert now - 1_000_000 <= t_ns <= now_ns()

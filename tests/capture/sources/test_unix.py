@@ -6,7 +6,6 @@ import socket
 import stat
 import struct
 import sys
-import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -175,8 +174,7 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(reader, peer, context):
         before_ns = context.now_ns()
         sock.send(record)
         bounds.append((before_ns, context.now_ns()))
-        time.sleep(0.002)
-    time.sleep(0.05)
+    wait_for(lambda: context.now_ns() > bounds[-1][1] + 50_000_000, "a later time")
     found = reader.until_frames(20)
     slack_ns = 1_000_000  # two clocks are read one after the other
     for t_ns, (low_ns, high_ns) in zip(found["t_host_ns"].tolist(), bounds, strict=True):
@@ -190,8 +188,8 @@ def test_two_senders_are_put_in_the_order_of_arrival(reader, peer):
     frames["id_flags"] = np.arange(40)
     for number in range(40):
         (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
-    while any(sender.receiver.pending for sender in reader.source._senders):
-        time.sleep(0.001)
+    senders = reader.source._senders
+    wait_for(lambda: not any(sender.receiver.pending for sender in senders), "both threads")
     assert reader.until_frames(40)["id_flags"].tolist() == list(range(40))
 
 
