@@ -50,11 +50,16 @@ def truth(count):
 def open_sink(path, **options):
     """Open a sink and define its channels."""
     sink = DurableSink(path, **options)
+    define(sink)
+    return sink
+
+
+def define(sink):
+    """Define the channels of the messages."""
     sink.define(Metadata("undulog", {"session_id": "killed", "epoch_ns": str(EPOCH_NS)}))
     sink.define(Schema(1, schema_text(STRING).encode(), "ros2msg", STRING))
     for key, topic in enumerate(TOPICS, start=1):
         sink.define(Channel(key, topic, "cdr", {}, 1))
-    return sink
 
 
 def write(sink, number):

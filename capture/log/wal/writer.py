@@ -113,6 +113,8 @@ class WriteAheadLog:
         self._position = self._defined = 0
         self._released = -1
         self._synced = 0
+        self._named = False  # whether the folder's own name was synced
+        self._lossy = False  # whether a sync has failed
         self._numbers = {MESSAGES: 0, DEFINITIONS: 0}
         self._sealed: list[Segment] = []
         self._spare: Segment | None = None
@@ -408,14 +410,18 @@ class WriteAheadLog:
                         segment.sync()
                 if not named and (folder := self.place) is not None:
                     sync_folder(folder)
+                    if not self._named:
+                        sync_folder(folder.parent)
+                        self._named = True
             except OSError as error:
                 # After a failed sync the kernel may drop the pages: a second try that succeeds
-                # would prove nothing.
+                # would prove nothing, so nothing more counts as synced.
                 reason = f"can't be brought to the disk: {os.strerror(error.errno or 0)}"
-                self._failure = LogWriteError(path, reason)
+                self._failure, self._lossy = LogWriteError(path, reason), True
                 return
-            before = sealed[-1].last if sealed else self._synced
-            self._synced = min(position, max(before, reached))
+            if not self._lossy:
+                before = sealed[-1].last if sealed else self._synced
+                self._synced = min(position, max(before, reached))
 
     def _hold(self) -> None:
         """Take the page faults ahead of the appending thread, which they would delay."""

@@ -1,0 +1,45 @@
+"""Edited logs on a disk that forgets what wasn't synced: the sources may be deleted then."""
+
+import pytest
+
+from support import durable_child as recorder
+from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.read_back import read
+
+START = """
+import os, shutil, signal, sys
+from pathlib import Path
+from support import durable_child as recorder
+from undulog.capture.log.cut import recover_log
+
+path = lambda name: Path(sys.argv[1], name)
+"""
+
+
+@pytest.fixture(scope="module")
+def programs():
+    with Programs(START) as running:
+        yield running
+
+
+def test_a_recovered_log_is_there_once_its_sources_may_be_deleted(tmp_path, programs):
+    disk = ForgettingDisk(tmp_path, programs)
+    killed = """
+sink = recorder.open_sink(path("run.mcap"), segment_size=1 << 18, ballast=0)
+for number in range(500):
+    recorder.write(sink, number)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    disk.run(killed, disk.root)
+    disk.settle()
+    recovered = """
+recover_log(path("run.mcap"), path("whole.mcap"))
+path("run.mcap.part").unlink()
+shutil.rmtree(path("run.mcap.wal"))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    disk.run(recovered, disk.root)
+    for loss in Loss:
+        found, warnings = read(disk.after(loss) / "whole.mcap")
+        assert found == recorder.truth(500)
+        assert warnings == []
