@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,6 +172,7 @@ class LiveFeed:
         max_messages: int = 4096,
         max_bytes: int = 2 << 20,
         max_rate_hz: float = 200.0,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Set up a feed to a relay that may come and go at any time.
 
@@ -180,7 +181,9 @@ class LiveFeed:
             max_messages: Most messages that wait, beside those of one datagram.
             max_bytes: Most bytes that wait, beside one datagram.
             max_rate_hz: Highest rate of a channel of samples; events are never left out.
+            clock: Returns the time [ns, monotonic].
         """
+        self._clock = clock
         self.path = Path(path)
         self.counts = LiveCounts()
         self._max_messages, self._max_bytes = max_messages, max_bytes
@@ -195,7 +198,7 @@ class LiveFeed:
         self._unsent_definitions: deque[_Packed] = deque()
         self._waiting: _Packed | None = None
         self._full = False
-        self._now_ns = time.monotonic_ns()
+        self._now_ns = clock()
         self._renew_at_ns = 0
         self._send_at_ns = 0
 
@@ -262,7 +265,7 @@ class LiveFeed:
 
     def pump(self) -> None:
         """Send waiting datagrams, for 0.3 ms at most; called once a tick."""
-        now_ns = self._now_ns = time.monotonic_ns()
+        now_ns = self._now_ns = self._clock()
         if now_ns >= self._renew_at_ns:
             self._renew(now_ns)
         if self._socket is None or not self._ripe(now_ns):
@@ -270,7 +273,7 @@ class LiveFeed:
         until_ns = now_ns + _BUDGET_NS
         self._send_at_ns = now_ns + _FILL_NS
         while self._send_one():
-            if time.monotonic_ns() >= until_ns:
+            if self._clock() >= until_ns:
                 return
 
     def close(self) -> None:
@@ -281,7 +284,7 @@ class LiveFeed:
             if not self.connected or (self._is_empty and self._taken(self._pack(Kind.END))):
                 break
             time.sleep(_END_PAUSE_S)
-        self._lose(time.monotonic_ns())
+        self._lose(self._clock())
         self._renew_at_ns = _NEVER_NS
 
     def _pack(self, kind: Kind, records: Sequence[bytes] = ()) -> _Packed:

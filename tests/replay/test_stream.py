@@ -1,7 +1,6 @@
 """A session sent to a viewer while it is converted, received by Rerun itself, against its file."""
 
 import signal
-import time
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from support import golden_pictures
+from support.processes import wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
@@ -206,8 +206,7 @@ def test_a_viewer_that_dies_is_reported(long_file, tmp_path):
 def test_an_analysis_that_dies_is_a_note(tmp_path):
     with Analysing(tmp_path / "gone.mcap", TOPICS) as analysing:
         analysing.start()
-        while (layer := analysing.layer) is None:
-            time.sleep(0.05)
+        layer = wait_for(lambda: analysing.layer, "its note")
     assert layer.analysis is None
     assert "not analysed: the analysis ended with 1" in layer.notes[0]
     assert "gone.mcap" in layer.notes[0]

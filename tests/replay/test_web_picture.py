@@ -6,7 +6,6 @@ rasterisers that know nothing of each other.
 
 import base64
 import io
-import time
 
 import numpy as np
 import pytest
@@ -72,14 +71,14 @@ class Page:
 
     def rest(self, patience_s=60.0):
         """A picture that is the same as the two before."""
-        deadline = time.monotonic() + patience_s
-        equal, last = 0, self.picture()
-        while equal < 2:
-            assert time.monotonic() < deadline, "the page's picture doesn't come to rest"
-            time.sleep(1.0)
-            picture = self.picture()
-            equal, last = equal + 1 if (picture == last).all() else 0, picture
-        return last
+        last = [self.picture() for _ in range(3)]
+
+        def rests():
+            last[:] = [*last[1:], self.picture()]
+            return (last[0] == last[1]).all() and (last[1] == last[2]).all()
+
+        wait_for(rests, "the page's picture doesn't come to rest", patience_s, pause_s=1.0)
+        return last[-1]
 
     def wait(self, until, patience_s=120.0):
         wait_for(lambda: until(self.picture()), "the page doesn't show the session", patience_s)

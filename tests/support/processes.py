@@ -79,7 +79,7 @@ def serving(scenario, *words, place="0", **options):
         yield robot, json.loads(line)
 
 
-def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
+def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=(), pause_s=0.005):
     """Return the value of a condition as soon as it holds; the processes ``alive`` must run."""
     deadline = time.monotonic() + seconds
     while not (found := condition()):
@@ -87,7 +87,7 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
             assert one.poll() is None, (what, one.communicate())
         assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
         each()
-        time.sleep(0.005)
+        time.sleep(pause_s)
     return found
 
 

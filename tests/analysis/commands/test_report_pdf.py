@@ -6,13 +6,13 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.paths import ROOT
+from support.processes import wait_for
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
 UNDULOG = Path(sys.executable).with_name("undulog")
@@ -137,13 +137,12 @@ def test_ctrl_c_ends_the_browser(short, tmp_path):
     hanging = script(tmp_path, f"touch {started}; bash -c 'sleep 600; # {tmp_path}' & wait")
     words = [UNDULOG, "report", short, "--pdf", out / "x.pdf", "--browser", hanging]
     running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    while not started.exists() and running.poll() is None:
-        time.sleep(0.05)
+    wait_for(started.exists, "the browser", alive=[running])
     os.kill(running.pid, signal.SIGINT)
     errors = running.communicate(timeout=60)[1].decode()
     assert (running.returncode, "interrupted" in errors) == (1, True)
     assert list(out.iterdir()) == []
-    assert processes_of(hanging) == []
+    wait_for(lambda: processes_of(hanging) == [], "what was killed")
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import random
 import shutil
 import subprocess
 import sys
-import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -114,6 +113,19 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
             shutil.rmtree(path.parent)
 
 
+WHOLE = 700_000
+"""Somewhat more than the bytes of the file."""
+
+
+def _kill_at(child, path, size):
+    """Kill a process as soon as its file has a size, or has its name."""
+    part = unfinished_path(path)
+    with contextlib.suppress(FileNotFoundError):
+        while not path.exists() and part.stat().st_size < size:
+            pass
+    child.kill()
+
+
 @pytest.mark.parametrize("runs", [6, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
     rng = random.Random(8)
@@ -126,8 +138,7 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
             reported = b""
             while len(reported) < 6000 * 8:
                 reported += os.read(child.stdout.fileno(), 1 << 16)
-            time.sleep(rng.uniform(0.0, 0.04))
-            child.kill()
+            _kill_at(child, path, rng.randrange(WHOLE))
             child.stdout.read()
         before = fingerprint(path.parent)
         found, warnings = read(path)

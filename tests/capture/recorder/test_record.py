@@ -214,6 +214,7 @@ def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path, 
 
 
 @pytest.mark.slow
+@pytest.mark.clock(0.1, "the wall clock that is set is the operating system's")
 def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path, output, bus):
     if not FAKETIME.exists():
         assert not os.environ.get("UNDULOG_REQUIRE_ALL_TESTS"), "faketime is not installed"

@@ -36,6 +36,7 @@ def send(path, seconds, lost):
 
 
 @pytest.mark.slow
+@pytest.mark.clock(0.02, "a drift is between two clocks that run")
 def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
     with recording(output, f"bus=unix:{source}") as recorder:

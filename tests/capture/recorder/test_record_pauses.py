@@ -35,6 +35,7 @@ def test_a_stopped_recorder_loses_no_accepted_frame(kind, when, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.clock(0.2, "the kernel stamps what arrives while the recorder is stopped")
 def test_frames_that_waited_during_a_stop_have_the_time_of_their_arrival(tmp_path):
     bus, output = tmp_path / "bus.sock", tmp_path / "run.mcap"
     with (

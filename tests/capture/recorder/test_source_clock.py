@@ -367,6 +367,7 @@ for k in range(3000):
 
 
 @pytest.mark.slow
+@pytest.mark.clock(0.02, "the kernel steers one of the two clocks")
 def test_another_process_with_another_clock_over_a_real_socket():
     """The kernel's raw clock, 80 ppm faster, against its steered one; the sender has both."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

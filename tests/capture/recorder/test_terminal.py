@@ -8,8 +8,7 @@ import re
 import select
 import struct
 import termios
-import time
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 
 import pytest
@@ -19,7 +18,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from support.paths import ROOT
-from support.processes import python
+from support.processes import python, wait_for
 from undulog.capture.log.health.bus_tally import measure_sources, read_statuses
 from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.screen import Terminal, clock_time, plain_line, screen, time_left
@@ -173,13 +172,16 @@ def terminal():
         yield ours, stream
 
 
-def read_until(number, wanted, patience_s=30.0):
-    found, deadline = b"", time.monotonic() + patience_s
-    while wanted.encode() not in found:
-        left_s = deadline - time.monotonic()
-        assert left_s > 0, found
-        if select.select([number], [], [], left_s)[0]:
+def read_until(number, wanted):
+    found = b""
+
+    def is_there():
+        nonlocal found
+        if select.select([number], [], [], 0)[0]:
             found += os.read(number, 1 << 16)
+        return wanted.encode() in found
+
+    wait_for(is_there, wanted)
     return found.decode()
 
 
@@ -202,17 +204,23 @@ def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(monkeypatch):
     """As after Ctrl-S: nobody reads, the kernel's buffer is full, a write waits for ever."""
     monkeypatch.setenv("TERM", "xterm-256color")
     with terminal() as (ours, stream):
+        os.set_blocking(stream.fileno(), False)
+        with suppress(BlockingIOError):
+            while True:
+                os.write(stream.fileno(), b"earlier output\n")
+        os.set_blocking(stream.fileno(), True)
         shown = Terminal(stream)
         for second in range(200):
             shown.show(replace(SNAPSHOT, elapsed_s=float(second)))
-            time.sleep(0.002)
         assert not shown.close()
         read_until(ours, "0:03:19")  # Ctrl-Q: it goes on with the latest state
-        deadline = time.monotonic() + 30
-        while not shown.close():
-            assert time.monotonic() < deadline
+
+        def is_closed():
             if select.select([ours], [], [], 0)[0]:
                 os.read(ours, 1 << 16)
+            return shown.close()
+
+        wait_for(is_closed, "the end")
 
 
 @pytest.mark.slow

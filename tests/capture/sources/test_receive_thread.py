@@ -3,15 +3,18 @@
 The senders are other processes; what ``send()`` returned to them is the truth.
 """
 
+import ctypes
+import fcntl
 import os
 import random
-import re
+import select
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
-import time
+import termios
 
 import bus_sender
 import numpy as np
@@ -75,15 +78,10 @@ class Sender:
         return accepted, refused, times
 
 
-def hold_the_interpreter(seconds):
-    """A C call that keeps the interpreter's lock."""
-    began, letters = time.monotonic(), 18
-    while (took := time.monotonic() - began) < seconds:
-        began = time.monotonic()
-        re.match(r"(a+)+$", "a" * letters + "b")
-        took = time.monotonic() - began
-        letters += took < seconds
-    assert took >= seconds
+def hold_the_interpreter(until):
+    """Keep the interpreter's lock in a C call until a file can be read, a minute at most."""
+    asked = struct.pack("ihh", until.fileno(), select.POLLIN, 0)
+    assert ctypes.PyDLL(None).poll(asked, ctypes.c_ulong(1), 60_000) == 1
 
 
 @pytest.mark.slow
@@ -107,7 +105,7 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
             wait_for(lambda: taken(accepted), "the first packets")
             before = accepted
             sender.start(500)
-            hold_the_interpreter(1.0)
+            hold_the_interpreter(sender.process.stdout)
             accepted, refused, sent_ns = sender.result()
             assert refused == 0
             wait_for(lambda: taken(accepted), "all packets")
@@ -145,7 +143,6 @@ def test_a_stream_is_kept_up_to_the_end(tmp_path):
             for number in range(4000):
                 if number == 3000:
                     recorder.send_signal(signal.SIGINT)
-                    signalled_ns = time.time_ns()
                 try:
                     client.sendall(b"< frame 1 %d.000000 11 >" % number)
                 except OSError:
@@ -156,7 +153,6 @@ def test_a_stream_is_kept_up_to_the_end(tmp_path):
     seconds = frames["t_device_ns"] // 1_000_000_000
     np.testing.assert_array_equal(seconds, np.arange(len(seconds)))
     assert len(seconds) >= 3000
-    assert frames["t_host_ns"][2999] < signalled_ns + 1_000_000
 
 
 def test_decoding_stops_when_its_time_is_over(tmp_path):
@@ -247,6 +243,11 @@ def test_a_quiet_sender_has_no_frames():
     receiver.close()
 
 
+def unread(sender):
+    """Return what the other end of a local socket has not taken yet [byte]."""
+    return int.from_bytes(fcntl.ioctl(sender, termios.TIOCOUTQ, bytes(4)), "little")
+
+
 STOPPED = """
 import socket, sys, time
 from undulog.capture.sources.reader_thread import ReceiveThread
@@ -279,7 +280,7 @@ def test_a_stop_with_packets_in_hand_breaks_no_connection(kind):
             for _ in range(5):  # received at once; the call goes on waiting for more
                 theirs.send(bytes(32))
                 sent += 1
-                time.sleep(0.002)
+                wait_for(lambda: not unread(theirs), "the receiver")
             receiver.send_signal(signal.SIGSTOP)
             os.waitid(os.P_PID, receiver.pid, os.WSTOPPED)
             theirs.send(bytes(32))

@@ -7,7 +7,6 @@ import random
 import re
 import select
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +56,10 @@ def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(tmp_path, list
     reader = listen(source_at(tmp_path, f"protocol={protocol}"))
     reader.until_event("connected")
     draw, stream, sent = random.Random(5), b"", []
+
+    def taken():
+        return sum(int(a["len"].sum()) for a in reader.fd_arrays)
+
     for k in range(3000):
         packet = make(draw.randrange(1, 9), 3, draw.randbytes(draw.randrange(3, 20)))
         if draw.random() < 0.05:
@@ -67,11 +70,13 @@ def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(tmp_path, list
         sent.append(packet)
         if k == 1500:
             line.send(stream + packet[:5])
-            time.sleep(1.0)
             total, stream = len(stream) + 5, b""
+            reader.until(
+                lambda least=total: taken() >= least
+            )  # the five are given up after a silence
     line.send(stream)
     total += len(stream)
-    reader.until(lambda: sum(int(a["len"].sum()) for a in reader.fd_arrays) >= total)
+    reader.until(lambda: taken() >= total)
     packets, _ = packets_in(reader.fd_frames)
     found = iter(packets)
     assert not [packet for packet in sent if not any(other == packet for other in found)]

@@ -2,7 +2,6 @@
 
 import os
 import resource
-import time
 
 import numpy as np
 import pytest
@@ -13,24 +12,36 @@ from support.recorders import ended, recording
 from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.log.wal.segment import Segment
 from undulog.capture.log.wal.writer import WriteAheadLog
 from undulog.capture.sources.unix_socket import FrameSender
 
 PAGE = resource.getpagesize()
 
 
-def test_the_appending_thread_takes_no_page_faults(tmp_path):
-    payload = bytes(1000)
-    with WriteAheadLog(tmp_path / "w", sync_interval_s=0.05) as wal:
-        wal.append(1, 0, 0, 0, payload)
-        wait_for(lambda: wal.synced, "the first sync")
-        time.sleep(0.2)  # the pages ahead are there by now
-        before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
-        for _ in range(200):  # 50 pages before each sync, 250 in all
-            for _ in range(5):
+def page_faults():
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+
+
+def test_the_appending_thread_takes_no_page_faults(tmp_path, monkeypatch):
+    payload, hold, holds = bytes(1000), Segment.hold, []
+
+    def counted(segment, size):
+        beyond = hold(segment, size)
+        holds.append(size)
+        return beyond
+
+    monkeypatch.setattr(Segment, "hold", counted)
+    faults = 0
+    with WriteAheadLog(tmp_path / "w", sync_interval_s=1000.0) as wal:
+        for _ in range(5):  # 50 pages before each sync, 250 in all
+            before = len(holds)  # one that had begun may not have seen what is there now
+            wait_for(lambda before=before: len(holds) >= before + 2, "the pages ahead")
+            begun = page_faults()
+            for _ in range(200):
                 wal.append(1, 0, 0, 0, payload)
-            time.sleep(0.005)
-        faults = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+            faults += page_faults() - begun
+            wal._sync()  # after which a page that is written faults anew
         wal.release(wal.position)
     assert faults < 1000 * 1040 / PAGE / 4  # one a page and one a sync without help
 
@@ -54,9 +65,10 @@ def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
             frame["t_device_ns"] = number = accepted
             accepted += sender.send(frame)
             if number == 500:
-                time.sleep(0.5)  # long enough to have taken them
-                os.truncate(tmp_path / "run.mcap.wal" / "000001.seg", size)
-            time.sleep(0.001)
+                taken = tmp_path / "run.mcap.wal" / "000001.seg"
+                last = frame.tobytes()
+                wait_for(lambda taken=taken, last=last: last[:8] in taken.read_bytes(), "all")
+                os.truncate(taken, size)
         _, err = ended(recorder)
     assert recorder.returncode == 1, err
     assert "000001.seg: was cut short by another program" in err
