@@ -42,6 +42,7 @@ from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.common.palette import joint_hex
+from undulog.capture.common.process import interrupted_later
 from undulog.capture.common.waits import end_process
 
 from ..catalog.fleet import Fleet
@@ -386,22 +387,25 @@ def write_pdf(page: str, output: Path, browser: str, longest_s: float = LONGEST_
 def _run(command: list[str], messages: Path, longest_s: float) -> None:
     """Run a browser and end the group of its processes, whatever happens."""
     with messages.open("wb") as log:
-        process = subprocess.Popen(  # noqa: S603  our own arguments
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=log,
-            process_group=0,  # a Ctrl-C ends it through us
-        )
+        process = None
         try:
+            with interrupted_later():
+                process = subprocess.Popen(  # noqa: S603  our own arguments
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=log,
+                    process_group=0,  # a Ctrl-C ends it through us
+                )
             code = process.wait(longest_s)
         except subprocess.TimeoutExpired:
             why = f"did not print the page within {longest_s:g} s and was ended"
             raise _failure(command[0], why, messages) from None
         finally:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            end_process(process, command[0])
+            if process is not None:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                end_process(process, command[0])
     if code:
         raise _failure(command[0], f"ended with exit code {code}", messages)
 

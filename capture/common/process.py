@@ -250,6 +250,30 @@ class StopRequest:
 
 
 @contextmanager
+def interrupted_later() -> Generator[None]:
+    """Raise a KeyboardInterrupt at the end of the block instead of within it.
+
+    A ``Popen`` that it ends has started a process that nobody knows.
+    """
+    came: list[tuple[int, FrameType | None]] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append((number, frame))
+
+    try:
+        former = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread, which alone is interrupted
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
+    if came and callable(former):
+        former(*came[0])
+
+
+@contextmanager
 def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
     """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop.
 

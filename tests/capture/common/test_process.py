@@ -1,11 +1,13 @@
 """Real signals to a real process: the file is whole, the second signal kills."""
 
 import signal
+import threading
 
 import pytest
 
 from support.processes import python_started
 from undulog.capture import Session
+from undulog.capture.common.process import interrupted_later
 
 RECORDER = """
 import sys, time
@@ -36,6 +38,22 @@ def test_a_signal_ends_between_samples_and_leaves_a_whole_file(tmp_path, number)
     with Session.open(path) as session:
         assert session.warnings == []
         assert session.joints("/joint_states").values[0].tolist() == list(range(ticks))
+
+
+def test_an_interrupt_is_raised_after_the_block_that_it_must_not_end():
+    done = []
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        with interrupted_later():
+            signal.raise_signal(signal.SIGINT)
+            done.append("the block")
+        done.append("what follows")
+    assert done == ["the block"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with interrupted_later():
+        pass
+    thread = threading.Thread(target=interrupted_later().__enter__)
+    thread.start()
+    thread.join()
 
 
 def test_the_second_signal_acts_as_usual():
