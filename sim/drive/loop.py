@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -14,6 +13,7 @@ import numpy as np
 
 from undulog.capture.bus.encoding import BusEncoder, BusValue, poll_frames
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.clock import REAL, Clock
 from undulog.capture.common.errors import SourceError, UndulogError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, empty_frames
@@ -67,8 +67,9 @@ class WallPace:
     by_the_clock = True
     """Whether the clock sets the pace, rather than the robot."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, clock: Clock = REAL) -> None:
         """The first tick is at once."""
+        self._clock = clock
         self.overruns = 0
         self.late_s = 0.0
         self._link, self._period_ns = link, 1_000_000_000 // CONTROL_RATE_HZ
@@ -84,14 +85,14 @@ class WallPace:
         Raises:
             SourceError: If the bus is lost.
         """
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
         if self._tick < 0:
             self._tick, self._start_ns = 0, now_ns
             return 0, self._link.receive()
         due_ns = self._start_ns + (self._tick + 1) * self._period_ns
         while now_ns < due_ns:
-            time.sleep((due_ns - now_ns) * 1e-9)
-            now_ns = time.monotonic_ns()
+            self._clock.sleep((due_ns - now_ns) * 1e-9)
+            now_ns = self._clock.monotonic_ns()
         # Also where the process was stopped while it slept: what is over is left out.
         left_out = (now_ns - due_ns) // self._period_ns
         self.overruns += left_out

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-import time
 from bisect import bisect_left, bisect_right
 from contextlib import ExitStack
 from dataclasses import dataclass
 
 from undulog.capture.common.arrays import NS
+from undulog.capture.common.clock import REAL, Clock
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import raised_priority
 
@@ -91,19 +91,20 @@ class Pacer:
         epoch_ns: The robot's clock at zero [Unix ns].
     """
 
-    def __init__(self, period_ns: int, *, fast: bool = False) -> None:
+    def __init__(self, period_ns: int, *, fast: bool = False, clock: Clock = REAL) -> None:
         """Start the robot's clock at zero.
 
         Args:
             period_ns: Control period [ns].
             fast: Don't keep to the wall clock: each tick is due at once, and the robot's clock
                 shows simulated time.
+            clock: The computer's clocks.
         """
         self.period_ns = period_ns
         self.tally = PaceTally()
         self._fast = fast
-        self._zero_ns = time.monotonic_ns()
-        self.epoch_ns = time.time_ns()
+        self._clock = clock
+        self._zero_ns, self.epoch_ns = clock.monotonic_ns(), clock.wall_ns()
         self._present_ns = 0
         self._from_tick = [0]  # where simulated time stood still, and tick 0 as seen from there on
         self._start_ns = [0]
@@ -116,7 +117,7 @@ class Pacer:
 
     def now_ns(self) -> int:
         """The robot's clock [ns]."""
-        return self._present_ns if self._fast else time.monotonic_ns() - self._zero_ns
+        return self._present_ns if self._fast else self._clock.monotonic_ns() - self._zero_ns
 
     def start(self, start_ns: int) -> None:
         """Say when tick 0 is due.

@@ -50,6 +50,10 @@ def running_far_end(*words):
             one.kill()
 
 
+# A stall of the far end, or of the way to it, is one of processes and of the kernel's sockets.
+pytestmark = pytest.mark.clock(0.02, "processes are stopped, and routers delay what they route")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Commands at 3.25 rad/s, for the snake and for a servo that answers requests."""
