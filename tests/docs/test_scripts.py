@@ -1,24 +1,15 @@
-"""Every script of the manual runs: each has --quick, few draws and short runs, for this test."""
+"""Every study runs: each has --quick, few draws and short runs, for this test."""
 
 import os
 import sys
 
 import pytest
 
-from support.paths import ROOT
+from support.paths import DOCS, ROOT, STUDIES
 from support.processes import run
 
-DOCS = ROOT / "docs"
-RUN_ELSEWHERE = {
-    "conf.py",
-    "notebook_page.py",
-    "reference_pages.py",
-    "result_schemas.py",
-}
-"""Run by ``make pages`` and Sphinx (``make docs``), the others by tests of their own, too."""
-
 OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "pictures.py", "real_robots.py"}
-TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - OWN_TESTS)
+TABLES = sorted({path.name for path in STUDIES.glob("*.py")} - OWN_TESTS)
 
 pytestmark = [pytest.mark.slow, pytest.mark.built("scripts")]
 
@@ -32,21 +23,21 @@ def printed(*words):
 
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_are_printed(name):
-    lines = printed(DOCS / name, "--quick").splitlines()
+    lines = printed(STUDIES / name, "--quick").splitlines()
     assert len(lines) > 3
     assert any(character.isdigit() for character in lines[-1])
 
 
 def test_the_oscillator_table_predicts_the_closed_loop():
     """Three yaw joints are few, but the closed loop has gone where P and R say."""
-    text = printed(DOCS / "oscillator_tables.py", "--quick")
+    text = printed(STUDIES / "oscillator_tables.py", "--quick")
     labels = ("moved by", "off by")
     moved, off = (float(text.partition(label)[2].partition("%")[0]) for label in labels)
     assert 0 < off < moved
 
 
 def test_the_figures_of_the_paper_are_drawn(tmp_path):
-    printed(DOCS / "paper_figures.py", tmp_path / "sessions", tmp_path / "images", "--quick")
+    printed(STUDIES / "paper_figures.py", tmp_path / "sessions", tmp_path / "images", "--quick")
     assert names(tmp_path / "images") == {path.name for path in DOCS.glob("images/paper-*.svg")}
 
 
@@ -57,7 +48,7 @@ def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, command):
     command("analyse", session, "-o", result)
     command("report", session, "-o", page)
     images = tmp_path / "images"
-    printed(DOCS / "pictures.py", tmp_path, images, "--quick")
+    printed(STUDIES / "pictures.py", tmp_path, images, "--quick")
     drawn = {"clip.gif", "replay-mean-cycle.png", "response.svg", "side-by-side.png"}
     assert names(images) == drawn <= names(DOCS / "images")
 

@@ -1,8 +1,8 @@
 """The page on recordings of real robots: its numbers and its pictures.
 
-``python docs/real_robots.py DATA``: imports and analyses each public recording in ``DATA`` by the
-commands that the page shows, fills their numbers into ``real-robots.txt``, and writes
-``explanation/real-robots.md`` and the pictures beside it. With ``--out`` they go elsewhere.
+``python studies/real_robots.py DATA``: imports and analyses each public recording in ``DATA`` by
+the commands that the page shows, fills their numbers into ``docs/real-robots.txt``, and writes
+``docs/explanation/real-robots.md`` and its pictures. With ``--out`` they go elsewhere.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1] / "docs"
 COMMANDS = """
 import DATA/so101/coupled_joints -o so101.mcap
 report so101.mcap -o so101.html --plots so101-plots
@@ -156,7 +156,7 @@ def main() -> None:
     """Write the page and its pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path, help="the folder of the recordings")
-    parser.add_argument("--out", type=Path, default=HERE, help="instead of the manual's folder")
+    parser.add_argument("--out", type=Path, default=DOCS, help="instead of the manual's folder")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -165,7 +165,7 @@ def main() -> None:
         (given.out / "explanation").mkdir(exist_ok=True)
         for plot, picture in PICTURES.items():
             shutil.copy(folder / plot, given.out / "images" / picture)
-        text = (HERE / "real-robots.txt").read_text()
+        text = (DOCS / "real-robots.txt").read_text()
         commands = "\n".join(f"undulog {line}" for line in COMMANDS.strip().splitlines())
         for place, value in (values(folder) | {"commands": commands}).items():
             text = text.replace(f"@{place}@", value)

@@ -1,10 +1,10 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
-``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
-screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the view of a recording that
-runs, a session of the twin beside its commands run again on ground with less sideways grip, the
-body's motion, and the report's first figure as a picture of its own that follows the reader's light
-or dark scheme. With ``--quick`` one tab, a small clip, sessions of 3 s, to see that it runs.
+``python studies/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them
+off screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the view of a recording
+that runs, a session of the twin beside its commands run again on ground with less sideways grip,
+the body's motion, and the report's first figure as a picture of its own that follows the reader's
+light or dark scheme. With ``--quick`` one tab, a small clip, sessions of 3 s, to see that it runs.
 """
 
 import argparse

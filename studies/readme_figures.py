@@ -1,6 +1,6 @@
 """Figures of the README: sampling times of joints, and a weak joint.
 
-``python docs/readme_figures.py docs/images``: simulates and records what they show. With
+``python studies/readme_figures.py docs/images``: simulates and records what they show. With
 ``--quick`` the runs are short, only to see that it runs.
 """
 

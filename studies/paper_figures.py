@@ -1,7 +1,7 @@
 """The paper's figures, drawn from the shipped scenarios.
 
-``python docs/paper_figures.py out/paper docs/images``: runs each scenario that is not in the first
-folder yet, and writes one SVG a figure into the second. All that is drawn is read from the
+``python studies/paper_figures.py out/paper docs/images``: runs each scenario that is not in the
+first folder yet, and writes one SVG a figure into the second. All that is drawn is read from the
 sessions, as anyone would read them. With ``--quick`` the runs are short and the figures
 meaningless, only to see that it runs.
 """

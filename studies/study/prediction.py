@@ -19,9 +19,9 @@ errors, in shares of the kick:
 * ``still``: of 'nothing moves';
 * ``toeplitz``: of a homogeneous chain's P, as strong (:func:`homogeneous`), the rest as measured.
 
-``nice -n 15 .venv/bin/python docs/study/prediction.py --out out/prediction`` computes all, an hour
-and a half of one core; every computation is a file, so an interrupted one goes on where it stopped.
-``--quick`` takes 5 and 9 yaw joints and 3 kicks.
+``nice -n 15 .venv/bin/python studies/study/prediction.py --out out/prediction`` computes all, an
+hour and a half of one core; every computation is a file, so an interrupted one goes on where it
+stopped. ``--quick`` takes 5 and 9 yaw joints and 3 kicks.
 """
 
 from __future__ import annotations
