@@ -435,7 +435,7 @@ def _scenario(case: Case, duration_s: float, kind: str, chain: dict):
 def main() -> None:
     """Compute what is asked for, and print it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, help="folder of the row files")
+    parser.add_argument("-o", "--out", type=Path, help="folder of the row files")
     parser.add_argument("--quick", action="store_true", help="5 and 9 yaw joints, 3 kicks")
     parser.add_argument("--joints", type=int, nargs="*", help="yaw joints")
     parser.add_argument(

@@ -51,7 +51,7 @@ def main() -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the short form")
-    parser.add_argument("--out", type=Path, help="folder of all rows")
+    parser.add_argument("-o", "--out", type=Path, help="folder of all rows")
     parser.add_argument("--workers", type=int, default=2, help="runs at a time")
     parser.add_argument("--no-runs", action="store_true", help="page from the rows that are there")
     parser.add_argument("--no-page", action="store_true", help="only run")
