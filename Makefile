@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures pages \
-  pages-scripts pages-tables golden lock release install-paths clean
+  pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,7 +78,7 @@ campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=20
 	PYTHONPATH=tests:bench:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
 
 study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
-	$(BIN)/python docs/study/study.py $(if $(LONG),,--quick)
+	$(BIN)/python studies/study/study.py $(if $(LONG),,--quick)
 
 check: $(READY)  ## lint, format, types, layers, how README and tutorials read
 	$(BIN)/ruff check .
@@ -101,13 +101,13 @@ schemas: $(READY)  ## the JSON Schemas of the results, which ship with the packa
 	$(BIN)/python docs/reference_pages.py
 
 pictures: demo  ## the pictures of README and manual, from recorded sessions
-	$(BIN)/python docs/pictures.py $(DEMO) docs/images
-	$(BIN)/python docs/paper_figures.py out/paper docs/images
-	$(BIN)/python docs/readme_figures.py docs/images
+	$(BIN)/python studies/pictures.py $(DEMO)
+	$(BIN)/python studies/paper_figures.py out/paper
+	$(BIN)/python studies/readme_figures.py
 
 DATA ?= ../shared/data
-pages: $(READY)  ## the long parts of the manual: real robots (DATA=FOLDER with recordings), study, tutorials, tables
-	$(BIN)/python docs/real_robots.py $(DATA)
+pages: $(READY)  ## the long parts of the manual: real robots (DATA=FOLDER with recordings), tutorials, tables
+	$(BIN)/python studies/real_robots.py $(DATA)
 	$(MAKE) -j2 --output-sync=target pages-scripts pages-tables
 
 # Nothing is skipped for want of a tool.
@@ -119,6 +119,10 @@ pages-scripts: $(READY)
 
 pages-tables: $(READY)
 	$(BUILDING) $(BIN)/python -m pytest -p no:cacheprovider -m built tests --ignore=tests/docs
+
+nightly: $(READY)  ## every script of studies/ in its short form
+	UNDULOG_NIGHTLY=1 UNDULOG_REQUIRE_ALL_TESTS=1 $(BIN)/python -m pytest -p no:cacheprovider \
+	  -m nightly tests
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from mcap.reader import make_reader
-from measuring import arguments, in_turn, memory, took
+from measuring import arguments, in_turn, memory, timed, took
 from records import compared, verdict, versions
 
 from undulog.analysis.catalog.catalog import Catalog
@@ -111,9 +111,9 @@ def query(folder: str) -> tuple[float, int, float]:
     """Time [s], rows and peak memory [MB] of a query in a process of its own."""
     Catalog(folder).sql("select 1")  # imports
     catalog = Catalog(folder)  # which compares its files with their checksums anew
-    start = time.perf_counter()
-    rows = catalog.sql(f"select path, robot, start_ns, lag_sd from catalog where {WHERE}")
-    return time.perf_counter() - start, len(rows), memory("VmHWM") / 1e6
+    text = f"select path, robot, start_ns, lag_sd from catalog where {WHERE}"
+    used, rows = timed(partial(catalog.sql, text))
+    return used.wall_s, len(rows), memory("VmHWM") / 1e6
 
 
 def peer(lines: str) -> tuple[float, int, float]:
@@ -138,21 +138,15 @@ def alone(function: object, place: str) -> tuple[float, int, float]:
 
 def main() -> None:
     """Run everything and judge it."""
-    parser = arguments(__doc__)
+    parser = arguments(__doc__, runs=3)
     parser.add_argument("sessions", type=int, nargs="?", default=10_000)
     parser.add_argument("rows", type=int, nargs="?", default=1_000_000)
-    parser.add_argument("--runs", type=int, default=3, help="of the query")
     given = parser.parse_args()
     good: list[bool] = []
     with tempfile.TemporaryDirectory(prefix="undulog-bench-") as name:
         folder = Path(name)
         write(folder, given.sessions)
-        used = time.process_time()
-        first = Catalog(name).scan()
-        used = time.process_time() - used
-        rescan = time.process_time()
-        again = Catalog(name).scan()
-        rescan = time.process_time() - rescan
+        (used, first), (rescan, again) = (timed(lambda: Catalog(name).scan()) for _ in range(2))
         paths = sorted(folder.rglob("*.mcap"))
         summaries = took(partial(read_summaries, paths)).processor_s
         whole = took(partial(read_whole, paths[:COMPARED])).wall_s
@@ -163,12 +157,13 @@ def main() -> None:
             verdict("catalog: sessions read in the first scan", first.read, given.sessions, "",
                     most=False),
             verdict("catalog: sessions read with nothing new", again.read, 0, ""),
-            compared(f"catalog: facts of {size}", [used], [summaries], peer_name, bar=FACTS),
-            compared(f"catalog: scan of {size}, nothing new", [rescan], [summaries],
+            compared(f"catalog: facts of {size}", [used.processor_s], [summaries], peer_name,
+                     bar=FACTS),
+            compared(f"catalog: scan of {size}, nothing new", [rescan.processor_s], [summaries],
                      peer_name, bar=AGAIN),
         ]  # fmt: skip
         compared(
-            f"catalog: facts of {size}", [used], [whole],
+            f"catalog: facts of {size}", [used.processor_s], [whole],
             f"reading the columns of each by undulog (scaled from {COMPARED})", scale=scale,
         )  # fmt: skip
         with ProcessPoolExecutor(WRITERS, get_context("spawn")) as pool:

@@ -17,12 +17,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel
 from mcap.writer import Writer
-from measuring import arguments
+from measuring import arguments, in_turn
 from records import compared, versions
 
 from undulog.capture.log.wal.writer import WriteAheadLog
@@ -145,12 +146,10 @@ def run_in(folder: Path | None, way: str, work: Callable, payloads: list[bytes])
 
 def compare(payloads: list[bytes], runs: int, folder: Path | None) -> None:
     """Print the cost of each way."""
-    took = {way: [] for way in WAYS}
-    own = {way: [] for way in WAYS}
-    for _ in range(runs):
-        for way in WAYS:
-            took[way].append(run_in(folder, way, measure, payloads))
-            own[way].append(run_in(folder, way, processor_time, payloads))
+    kinds = measure, processor_time
+    works = [partial(run_in, folder, way, kind, payloads) for way in WAYS for kind in kinds]
+    found = in_turn(runs, *works)
+    took, own = (dict(zip(WAYS, found[k::2], strict=True)) for k in range(2))
     means = {way: float(np.median(found)) for way, found in own.items()}
     peer = f"{versions('mcap')} Writer"
     what = f"keep a message of {len(payloads[0])} B, recorder's sink"

@@ -6,7 +6,7 @@ viewer, Rerun's own gRPC server, is frozen. Printed are the cost of a message (t
 together, mean), of an offer alone, and of a pump (median, 99th percentile, largest); all as a
 recorder meets them, with the caches gone cold between ticks. First, an offer in a tight loop.
 
-Run: python bench/live_view.py [--seconds 20]
+Run: python bench/live_view.py [--seconds 20]  # of each case
 """
 
 from __future__ import annotations
@@ -145,9 +145,7 @@ def connect(feed: LiveFeed) -> None:
 
 def main() -> None:
     """Measure all cases."""
-    parser = arguments(__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each case")
-    seconds = parser.parse_args().seconds
+    seconds: float = arguments(__doc__, seconds=20.0).parse_args().seconds
     with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
         path = Path(folder) / "live.sock"
         feed = LiveFeed(path)

@@ -25,6 +25,7 @@ Not ``ru_maxrss``, which in a child is at least what its parent had when it was 
 """
 TICKS_S = os.sysconf("SC_CLK_TCK")
 _Figure = TypeVar("_Figure")
+_Result = TypeVar("_Result")
 
 
 class Took(NamedTuple):
@@ -45,15 +46,24 @@ def arguments(doc: str | None, **defaults: float) -> argparse.ArgumentParser:
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     for name, default in defaults.items():
-        parser.add_argument(f"--{name}", type=type(default), default=default)
+        parser.add_argument(f"--{name.replace('_', '-')}", type=type(default), default=default)
     return parser
+
+
+def timed(work: Callable[[], _Result]) -> tuple[Took, _Result]:
+    """Return the cost of some work, and its result."""
+    wall, processor = time.perf_counter(), time.process_time()
+    result = work()
+    return Took(time.perf_counter() - wall, time.process_time() - processor), result
 
 
 def took(work: Callable[[], object]) -> Took:
     """Return the cost of some work; its result is dropped within that time."""
-    wall, processor = time.perf_counter(), time.process_time()
-    work()
-    return Took(time.perf_counter() - wall, time.process_time() - processor)
+
+    def dropped() -> None:
+        work()
+
+    return timed(dropped)[0]
 
 
 def command_took(*command: object, **options: object) -> Took:

@@ -15,7 +15,6 @@ import json
 import os
 import subprocess
 import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -26,7 +25,7 @@ import numpy as np
 from foreign_reader import READERS
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from measuring import HERE, arguments
+from measuring import HERE, arguments, timed
 from records import compared, not_run, versions
 
 from undulog.capture import Session, SessionWriter
@@ -88,15 +87,6 @@ def read_peer(path: Path) -> dict[str, FloatArray]:
     return {name: np.array(values).T for name, values in rows.items()}
 
 
-def timed(
-    read: Callable[[Path], dict[str, FloatArray]], path: Path
-) -> tuple[float, dict[str, FloatArray]]:
-    """Return seconds of wall-clock time and what was read."""
-    start = time.perf_counter()
-    columns = read(path)
-    return time.perf_counter() - start, columns
-
-
 def main() -> None:
     """Write, read with each in turn, compare, print."""
     options = arguments(__doc__, minutes=5.0, runs=3).parse_args()
@@ -119,8 +109,8 @@ def main() -> None:
         for _ in range(options.runs):  # in turn, so that a drift of the machine hits all
             found: list[dict[str, FloatArray]] = []
             for name, read in readers.items():
-                seconds, columns = timed(read, path)
-                took[name].append(seconds)
+                used, columns = timed(partial(read, path))
+                took[name].append(used.wall_s)
                 found.append(columns)
             *ours, theirs = found
             for mine in ours:
@@ -130,7 +120,7 @@ def main() -> None:
                 if (read_by := foreign(library, path)) is not None:
                     assert read_by["messages"] == count // len(TOPICS), read_by
                     took[library].append(read_by["seconds"])
-                    took[ours_to(library)].append(timed(of_one_topic, path)[0])
+                    took[ours_to(library)].append(timed(partial(of_one_topic, path))[0].wall_s)
                     known[library] = read_by["version"]
     what = "read all joint columns"
     for way, bar in ((f"{threads} threads", BAR), ("1 thread", None)):

@@ -163,9 +163,7 @@ def delays_s(packets: list[bytes]) -> np.ndarray[tuple[int], np.dtype[np.float64
 
 def main() -> None:
     """Print both tables."""
-    parser = arguments(__doc__, runs=3)
-    parser.add_argument("--frames", type=int, default=20_000, help="packets")
-    args = parser.parse_args()
+    args = arguments(__doc__, frames=20_000, runs=3).parse_args()
     for protocol in ("feetech", "dynamixel2"):
         packets = stream(protocol, args.frames)
         data = b"".join(packets)

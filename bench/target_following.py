@@ -158,10 +158,8 @@ def study(
 
 def main() -> None:
     """Run, print, keep."""
-    parser = arguments(__doc__, jobs=2)
+    parser = arguments(__doc__, jobs=2, follow_limit=90.0, walk_limit=60.0)
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
-    parser.add_argument("--follow-limit", type=float, default=90.0, help="longest run [s]")
-    parser.add_argument("--walk-limit", type=float, default=60.0, help="longest run [s]")
     parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/target_following.json"))
     options = parser.parse_args()

@@ -135,11 +135,15 @@ def pytest_enter_pdb():
     _watch()
 
 
+LEFT_OUT = {"built": "UNDULOG_BUILD_PAGES", "nightly": "UNDULOG_NIGHTLY"}
+"""Markers of tests that are left out, and the environment variable that lets them in if it is 1:
+the long parts of the manual are for `make pages`, the studies for `make nightly`."""
+
+
 def pytest_collection_modifyitems(config, items):
-    """Leave the long parts of the manual, marked `built`, to `make pages`."""
-    if os.environ.get("UNDULOG_BUILD_PAGES") == "1":
-        return
-    left_out = {item for item in items if item.get_closest_marker("built")}
+    """Leave tests to the targets that they are for."""
+    unwanted = [mark for mark, variable in LEFT_OUT.items() if os.environ.get(variable) != "1"]
+    left_out = {item for item in items if any(map(item.get_closest_marker, unwanted))}
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]
 

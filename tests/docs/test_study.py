@@ -1,7 +1,6 @@
-"""The study of body couplings: its short form runs, and each conclusion holds or is open there."""
+"""The study of body couplings: its rows give its page, its measures are those of closed forms."""
 
 import itertools
-import sys
 
 import numpy as np
 import pytest
@@ -10,26 +9,10 @@ from study.conclusions import CONCLUSIONS, evaluate
 from study.results import results_of
 from study.rows import read_rows
 
-from support.paths import ROOT
-from support.processes import run
+from support.paths import DOCS, STUDIES
 from undulog.analysis.oscillators.predictions import path_laplacian
 
-LONG = ROOT / "docs/study/rows/long.parquet"
-NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
-"""Left open by the short form: too few points, or chains too short or of too few lengths."""
-
-
-@pytest.mark.slow
-@pytest.mark.built("study")
-def test_the_short_form_reaches_the_conclusions(tmp_path):
-    script = ROOT / "docs/study/study.py"
-    run(sys.executable, str(script), "--quick", "--out", str(tmp_path), timeout=1800, code=0)
-    verdicts = evaluate(results_of(tmp_path / "rows.parquet"))
-    assert {one.conclusion.name for one in verdicts if one.holds is None} == NEEDS_MORE
-    assert [one for one in verdicts if one.holds is False] == []
-    page = (tmp_path / "study.md").read_text()
-    for name in (one.name for one in CONCLUSIONS):
-        assert f"`{name}`" in page
+LONG = STUDIES / "study/rows/long.parquet"
 
 
 @pytest.mark.slow
@@ -37,11 +20,11 @@ def test_the_short_form_reaches_the_conclusions(tmp_path):
 def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     results = results_of(LONG)
     assert [one for one in evaluate(results) if not one.holds] == []
-    assert results.digest in (ROOT / "docs/study.md").read_text()
+    assert results.digest in (DOCS / "study.md").read_text()
 
 
 def test_both_engines_give_the_same_couplings_and_predict_up_to_50_joints():
-    found = prediction.rows(ROOT / "docs/study/rows/prediction")
+    found = prediction.rows(STUDIES / "study/rows/prediction")
     chain = ["n", "law", "stall", "amplitude"]
     engines = [found[(found.kind == "P") & (found.engine == one)] for one in prediction.ENGINES]
     pairs = engines[0].merge(engines[1], on=chain)

@@ -65,6 +65,22 @@ def test_afterwards():
 """
 
 
+MARKED = """
+import pytest
+
+@pytest.mark.slow
+def test_slow(): pass
+
+@pytest.mark.slow
+@pytest.mark.built("part")
+def test_built(): pass
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_nightly(): pass
+"""
+
+
 def copy_conftest(folder):
     """Copy what limits tests to a folder of its own."""
     (folder / "support").mkdir()
@@ -80,6 +96,20 @@ def running(folder):
             if cwd.readlink() == folder:
                 found.append((cwd.parent / "cmdline").read_bytes().replace(b"\0", b" "))
     return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("variable", "wanted"),
+    [("", {"slow"}), ("BUILD_PAGES", {"slow", "built"}), ("NIGHTLY", {"slow", "nightly"})],
+)
+def test_a_marker_leaves_its_tests_to_their_target(tmp_path, variable, wanted):
+    copy_conftest(tmp_path)
+    (tmp_path / "test_marked.py").write_text(MARKED)
+    words = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider"]
+    inherited = {k: v for k, v in os.environ.items() if not k.endswith(("BUILD_PAGES", "NIGHTLY"))}
+    done = run(*words, tmp_path, cwd=tmp_path, env=inherited | {f"UNDULOG_{variable}": "1"})
+    assert set(re.findall(r"::test_(\w+)", done.stdout)) == wanted, done.stdout
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """The tables of docs/explanation/faults.md on errors: how often an answer names what is not there.
 
-``.venv/bin/python docs/answer_tables.py [SESSIONS]`` prints them as Markdown; with 2,000 sessions
-a cell it takes about twenty minutes on two cores. Nothing is written to files: commands and
-positions are made in memory and given to the same functions as those of a session.
+``.venv/bin/python studies/answer_tables.py [SESSIONS]`` prints them as Markdown; with 2,000
+sessions a cell it takes about twenty minutes on two cores. Nothing is written to files: commands
+and positions are made in memory and given to the same functions as those of a session.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The table of docs/explanation/energy.md: energies by the log against the twin's ledger.
 
-``.venv/bin/python docs/energy_tables.py`` runs all shipped scenarios, which takes some minutes, and
-prints the table as Markdown; ``--write`` puts it into the page. With names, those only.
+``.venv/bin/python studies/energy_tables.py`` runs all shipped scenarios, which takes some minutes,
+and prints the table as Markdown; ``--write`` puts it into the page. With names, those only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BAR = 0.005
 NET_FLOOR = 0.05
 """E_net may vanish: its error is held against at least this part of E_abs."""
 
-PAGE = Path(__file__).parent / "explanation/energy.md"
+PAGE = Path(__file__).parents[1] / "docs/explanation/energy.md"
 BEGIN, END = "<!-- table by energy_tables.py -->", "<!-- end of the table -->"
 TITLES = {"net": "E_net", "plus": "E_plus", "abs": "E_abs", "el": "E_el", "el_clipped": "E_el+"}
 

@@ -1,10 +1,11 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
-``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
-screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the view of a recording that
-runs, a session of the twin beside its commands run again on ground with less sideways grip, the
-body's motion, and the report's first figure as a picture of its own that follows the reader's light
-or dark scheme. With ``--quick`` one tab, a small clip, sessions of 3 s, to see that it runs.
+``python studies/pictures.py`` draws into ``docs/images``, or elsewhere with ``-o``: the replay's
+tabs as Rerun's viewer draws them off screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers
+libvulkan1), the view of a recording that runs, a session of the twin beside its commands run again
+on ground with less sideways grip, the body's motion, and the report's first figure as a picture of
+its own that follows the reader's light or dark scheme. With ``--quick`` one tab, a small clip and
+short sessions, to see that it runs.
 """
 
 import argparse
@@ -23,9 +24,11 @@ from PIL import Image
 import undulog
 from undulog.replay.viewer import HeadlessViewer
 
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs/images"
 SECONDS = 12.3
 SCENARIO = "weak-servo-pi3"
-QUICK_S = 3.0
+QUICK_S, QUICK_DEMO_S = 3.0, 14.5
 LIVE_S = 13.0
 DEGREES = 90
 TITLE_BAR = 36
@@ -37,6 +40,24 @@ SMALL = ("--fps", "12", "--size", "720x406")
 """Small enough for a page."""
 QUICK = ("--fps", "2", "--size", "320x180")
 TABS = {"session": "replay", "cycles": "replay-cycles", "mean-cycle": "replay-mean-cycle"}
+
+
+def undulog_all(*commands: list[str | Path]) -> None:
+    """Run commands one after the other; end at the first one that fails."""
+    for words in commands:
+        if code := undulog.run([*map(str, words)]):
+            sys.exit(code)
+
+
+def short_demo(demo: Path) -> None:
+    """Make what ``make demo`` leaves, of a session just long enough for the clip."""
+    session = demo / "session.mcap"
+    length = ["--duration", f"{QUICK_DEMO_S:g}", "--kernels", "numba"]
+    undulog_all(
+        ["sim", "run", SCENARIO, *length, "-o", session],
+        ["analyse", session, "-o", demo / "result.json"],
+        ["report", session, "-o", demo / "report.html"],
+    )
 
 
 def window_picture(
@@ -65,8 +86,7 @@ def replay_picture(demo: Path, images: Path, tab: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "tab.rrd"
         words = ["--result", demo / "result.json", "--tab", tab, "--save", recording]
-        if undulog.run(["view", *map(str, (demo / "session.mcap", *words))]):
-            sys.exit(f"no recording of {demo / 'session.mcap'}")
+        undulog_all(["view", demo / "session.mcap", *words])
         degrees = DEGREES if tab == "mean-cycle" else None
         window_picture(recording, images / f"{TABS[tab]}.png", SECONDS, degrees=degrees)
 
@@ -102,21 +122,17 @@ def side_by_side_picture(target: Path, *, quick: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         robot, twin, both = (f"{folder}/{name}" for name in ("robot.mcap", "twin.mcap", "both.rrd"))
         change = "world.ground.mu_normal=0.35"
-        for words in (
+        undulog_all(
             ["sim", "run", SCENARIO, *short, "-o", robot],
             ["replay", robot, "--on", "twin", "--set", change, "-o", twin],
             ["view", robot, twin, "--save", both],
-        ):
-            if code := undulog.run(words):
-                sys.exit(code)
+        )
         window_picture(Path(both), target, QUICK_S / 2 if quick else SECONDS)
 
 
 def clip(demo: Path, target: Path, *size: str) -> None:
     """Write the body's motion over one period."""
-    words = [demo / "session.mcap", "--clip", target, *CLIP, *size, "--force"]
-    if undulog.run(["view", *map(str, words)]):
-        sys.exit(f"no clip of {demo / 'session.mcap'}")
+    undulog_all(["view", demo / "session.mcap", "--clip", target, *CLIP, *size, "--force"])
 
 
 def response_picture(page: Path, target: Path) -> None:
@@ -141,19 +157,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("demo", type=Path, help="what `make demo` left")
-    parser.add_argument("images", type=Path, help="the folder to write to")
-    parser.add_argument("--quick", action="store_true", help="one tab, a small clip, 3 s")
+    parser.add_argument(
+        "demo", type=Path, nargs="?", default=ROOT / "out/demo", help="what `make demo` left"
+    )
+    parser.add_argument("-o", dest="images", type=Path, default=IMAGES, help="folder to write to")
+    parser.add_argument(
+        "--quick", action="store_true", help="one tab, a small clip, short sessions of its own"
+    )
     options = parser.parse_args()
     images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
-    for tab in list(TABS)[-1:] if options.quick else TABS:
-        replay_picture(options.demo, images, tab)
-    if not options.quick:
-        live_picture(images / "live.png")
-    side_by_side_picture(images / "side-by-side.png", quick=options.quick)
-    clip(options.demo, images / "clip.gif", *(QUICK if options.quick else SMALL))
-    response_picture(options.demo / "report.html", images / "response.svg")
+    with tempfile.TemporaryDirectory() as name:
+        demo: Path = options.demo
+        if options.quick:
+            demo = Path(name)
+            short_demo(demo)
+        for tab in list(TABS)[-1:] if options.quick else TABS:
+            replay_picture(demo, images, tab)
+        if not options.quick:
+            live_picture(images / "live.png")
+        side_by_side_picture(images / "side-by-side.png", quick=options.quick)
+        clip(demo, images / "clip.gif", *(QUICK if options.quick else SMALL))
+        response_picture(demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 

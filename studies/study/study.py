@@ -2,7 +2,7 @@
 
 ``make study`` is the short form: 5 and 9 yaw joints, a few minutes, page and rows under
 ``out/study/quick``. ``make study LONG=1`` is the long form; it goes on where it stopped, also from
-the rows in ``docs/study/rows/long.parquet`` where the code that determines them is the same,
+the rows in ``studies/study/rows/long.parquet`` where the code that determines them is the same,
 gathers its own there and writes ``docs/study.md`` with its figures.
 """
 
@@ -22,8 +22,9 @@ from undulog.replay.sweep.run import software
 from undulog.replay.sweep.sweep import prepare, run_sweep
 from undulog.replay.sweep.workers import LocalWorkers
 
-DOCS = Path(__file__).parents[1]
-OUT = DOCS.parent / "out" / "study"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+OUT = ROOT / "out" / "study"
 
 
 def run(folder: Path, stop: StopRequest, *, quick: bool, workers: int) -> bool:
@@ -50,7 +51,7 @@ def main() -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the short form")
-    parser.add_argument("--out", type=Path, help="folder of all rows")
+    parser.add_argument("-o", "--out", type=Path, help="folder of all rows")
     parser.add_argument("--workers", type=int, default=2, help="runs at a time")
     parser.add_argument("--no-runs", action="store_true", help="page from the rows that are there")
     parser.add_argument("--no-page", action="store_true", help="only run")

@@ -1,6 +1,6 @@
 """The tables of docs/explanation/estimators.md: lag and gain by our fit and by three common ways.
 
-``.venv/bin/python docs/estimator_tables.py`` prints them as Markdown; it takes about a minute;
+``.venv/bin/python studies/estimator_tables.py`` prints them as Markdown; it takes about a minute;
 with ``--quick`` some seconds, with few draws, only to see that it runs.
 """
 

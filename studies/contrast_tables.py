@@ -1,6 +1,6 @@
 """The table of docs/explanation/estimators.md on contrasts between joints that share noise.
 
-``.venv/bin/python docs/contrast_tables.py`` prints it as Markdown; it takes about half a minute.
+``.venv/bin/python studies/contrast_tables.py`` prints it as Markdown; it takes about half a minute.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The figures of docs/explanation/oscillators.md: P in contact, its modes, and what they predict.
 
-``nice .venv/bin/python docs/oscillator_tables.py 5 9 13`` prints those of chains with so many yaw
-joints (every other joint is a yaw joint, as in snake25), ``13:1.5`` those with servos of 1.5 N m
-instead of 0.25 N m. Each chain takes 2 m + 6 runs of 20 s or more on the compiled twin: half a
+``nice .venv/bin/python studies/oscillator_tables.py 5 9 13`` prints those of chains with so many
+yaw joints (every other joint is a yaw joint, as in snake25), ``13:1.5`` those with servos of 1.5 N
+m instead of 0.25 N m. Each chain takes 2 m + 6 runs of 20 s or more on the compiled twin: half a
 minute to one and a half. ``--quick`` takes 3 yaw joints, only to see that it runs.
 """
 

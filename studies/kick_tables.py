@@ -1,7 +1,7 @@
 """The tables of docs/explanation/method.md on kicks, whose runs differ beyond their own noise.
 
-``nice .venv/bin/python docs/kick_tables.py`` prints them as Markdown; it takes about a minute and a
-half. ``docs/kick_tables.py 2000`` makes so many experiments a row.
+``nice .venv/bin/python studies/kick_tables.py`` prints them as Markdown; it takes about a minute
+and a half. ``studies/kick_tables.py 2000`` makes so many experiments a row.
 
 Each experiment is the one that ``undulog plan phase-kicks`` writes, on a linear chain whose P, R, G
 and S are known in closed form. Each run's phases and log amplitudes scatter; the fit within a run

@@ -1,7 +1,8 @@
 """Figures of the README: sampling times of joints, and a weak joint.
 
-``python docs/readme_figures.py docs/images``: simulates and records what they show. With
-``--quick`` the runs are short, only to see that it runs.
+``python studies/readme_figures.py`` simulates and records what they show, and draws it into
+``docs/images``, or elsewhere with ``-o``. With ``--quick`` the runs are short, only to see that it
+runs.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import undulog
 from undulog.analysis import analyse_session
 from undulog.capture import Session
 
+IMAGES = Path(__file__).parents[1] / "docs/images"
 SLOT_S = 0.00039
 
 
@@ -52,14 +54,14 @@ def lags(session: Path) -> tuple[list[int], list[float], list[float]]:
 def main() -> None:
     """Draw both."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("images", type=Path, nargs="?", default=Path("docs/images"))
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("-o", dest="images", type=Path, default=IMAGES, help="folder to write to")
+    parser.add_argument("--quick", action="store_true", help="short runs")
     given = parser.parse_args()
     seconds = 6.5 if given.quick else 12.0
     mpl.rcParams.update({"svg.hashsalt": "undulog", "svg.fonttype": "none", "font.size": 9})
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        images = folder if given.quick else given.images
+        given.images.mkdir(parents=True, exist_ok=True)
         simulate(folder / "polled.mcap", f"sensing.servo.slot_s={SLOT_S}", seconds)
         number, true, stamped = lags(folder / "polled.mcap")
         figure, axes = plt.subplots(figsize=(6.4, 2.2), layout="constrained")
@@ -68,13 +70,13 @@ def main() -> None:
         axes.set(xlabel="joint, head to tail", ylabel="lag [ms]")
         axes.legend(frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
-        figure.savefig(images / "sampling-times.svg", metadata={"Date": None})
+        figure.savefig(given.images / "sampling-times.svg", metadata={"Date": None})
         simulate(folder / "weak.mcap", "servo_of.joint07.stall_torque=0.15", seconds)
         page, plots = folder / "weak.html", folder / "plots"
         words = ["report", folder / "weak.mcap", "-o", page, "--plots", plots]
         if undulog.run([str(word) for word in words]):
             raise SystemExit(1)
-        (plots / "segments.svg").replace(images / "weak-joint.svg")
+        (plots / "segments.svg").replace(given.images / "weak-joint.svg")
     for k, (a, b) in enumerate(zip(true, stamped, strict=True)):
         print(f"joint {number[k]:2d}: {a:6.2f} ms, with one stamp {b:6.2f} ms")
 

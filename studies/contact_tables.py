@@ -1,6 +1,6 @@
 """The table of docs/explanation/method.md on ground contact, of the twin, which knows it.
 
-``nice .venv/bin/python docs/contact_tables.py [SEED ...]`` prints it as Markdown; a seed takes
+``nice .venv/bin/python studies/contact_tables.py [SEED ...]`` prints it as Markdown; a seed takes
 half a minute of CPU. The scales of ``analysis/body/ground_contact.py`` were chosen by seed 1, so it
 is none of those that are tried by default.
 """

@@ -1,6 +1,6 @@
 """The table of docs/explanation/estimators.md on joints at two frequencies.
 
-``.venv/bin/python docs/group_tables.py [DRAWS]`` prints it; 500 draws take some minutes.
+``.venv/bin/python studies/group_tables.py [DRAWS]`` prints it; 500 draws take some minutes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The page on recordings of real robots: its numbers and its pictures.
 
-``python docs/real_robots.py DATA``: imports and analyses each public recording in ``DATA`` by the
-commands that the page shows, fills their numbers into ``real-robots.txt``, and writes
-``explanation/real-robots.md`` and the pictures beside it. With ``--out`` they go elsewhere.
+``python studies/real_robots.py DATA``: imports and analyses each public recording in ``DATA`` by
+the commands that the page shows, fills their numbers into ``docs/real-robots.txt``, and writes
+``docs/explanation/real-robots.md`` and its pictures, or elsewhere with ``-o``. With ``--quick`` it
+makes no reports and so no pictures, which is half of the time.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 COMMANDS = """
 import DATA/so101/coupled_joints -o so101.mcap
 report so101.mcap -o so101.html --plots so101-plots
@@ -60,13 +62,15 @@ PICTURES = {
 }
 
 
-def run_all(data: Path, folder: Path) -> None:
-    """Run the commands in a folder."""
+def run_all(data: Path, folder: Path, *, quick: bool) -> None:
+    """Run the commands in a folder, all or those that give numbers."""
     (folder / "DATA").symlink_to(data.resolve())
     joint = MAP.format(column="s_pos", scale=1 / 22) + f"wrap = {4 * math.pi}\n"
     (folder / "joint.toml").write_text(joint)
     (folder / "motor.toml").write_text(MAP.format(column="m_pos", scale=1 / 22))
     for line in COMMANDS.strip().splitlines():
+        if quick and line.startswith("report"):
+            continue
         command = [sys.executable, "-m", "undulog", *shlex.split(line)]
         done = subprocess.run(  # noqa: S603 - the commands above
             command, cwd=folder, capture_output=True, text=True, check=False
@@ -155,17 +159,20 @@ def response_row(one: dict[str, Any]) -> tuple[str, ...]:
 def main() -> None:
     """Write the page and its pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("data", type=Path, help="the folder of the recordings")
-    parser.add_argument("--out", type=Path, default=HERE, help="instead of the manual's folder")
+    parser.add_argument(
+        "data", type=Path, nargs="?", default=ROOT.parent / "shared/data", help="the recordings"
+    )
+    parser.add_argument("-o", dest="out", type=Path, default=DOCS, help="folder to write to")
+    parser.add_argument("--quick", action="store_true", help="the page without its pictures")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        run_all(given.data, folder)
+        run_all(given.data, folder, quick=given.quick)
         (given.out / "images").mkdir(parents=True, exist_ok=True)
         (given.out / "explanation").mkdir(exist_ok=True)
-        for plot, picture in PICTURES.items():
+        for plot, picture in () if given.quick else PICTURES.items():
             shutil.copy(folder / plot, given.out / "images" / picture)
-        text = (HERE / "real-robots.txt").read_text()
+        text = (DOCS / "real-robots.txt").read_text()
         commands = "\n".join(f"undulog {line}" for line in COMMANDS.strip().splitlines())
         for place, value in (values(folder) | {"commands": commands}).items():
             text = text.replace(f"@{place}@", value)

@@ -1,8 +1,8 @@
 """The paper's figures, drawn from the shipped scenarios.
 
-``python docs/paper_figures.py out/paper docs/images``: runs each scenario that is not in the first
-folder yet, and writes one SVG a figure into the second. All that is drawn is read from the
-sessions, as anyone would read them. With ``--quick`` the runs are short and the figures
+``python studies/paper_figures.py out/paper``: runs each scenario that is not in the folder yet, and
+writes one SVG a figure into ``docs/images``, or elsewhere with ``-o``. All that is drawn is read
+from the sessions, as anyone would read them. With ``--quick`` the runs are short and the figures
 meaningless, only to see that it runs.
 """
 
@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import math
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,7 @@ from undulog.sim.scenario.world import World
 from undulog.sim.twin.reactions import amplitude, bend, frequency
 from undulog.sim.twin.recording import record
 
+IMAGES = Path(__file__).parents[1] / "docs/images"
 GREY = "#8c8c8c"
 STONE = "#c9cdd3"
 MODES = {"walk": "#e9ecef", "avoid": "#ffd8a8", "turn": "#b2f2bb", "shrink": "#d0bfff"}
@@ -318,8 +320,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("sessions", type=Path, help="the folder of the sessions")
-    parser.add_argument("images", type=Path, help="the folder to write to")
+    parser.add_argument("sessions", type=Path, nargs="?", help="folder that keeps the sessions")
+    parser.add_argument("-o", dest="images", type=Path, default=IMAGES, help="folder to write to")
     parser.add_argument("--quick", action="store_true", help="short runs")
     options = parser.parse_args()
     mpl.use("Agg")
@@ -328,11 +330,12 @@ def main() -> None:
     plt.rcParams |= {"figure.constrained_layout.use": True}
     images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
-    runs = Runs(options.sessions, quick=options.quick)
-    for name, draw in FIGURES.items():
-        path = images / f"{name}.svg"
-        draw(runs).savefig(path, metadata={"Date": None})
-        print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    with tempfile.TemporaryDirectory() as temporary:
+        runs = Runs(options.sessions or Path(temporary), quick=options.quick)
+        for name, draw in FIGURES.items():
+            path = images / f"{name}.svg"
+            draw(runs).savefig(path, metadata={"Date": None})
+            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

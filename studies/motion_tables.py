@@ -1,6 +1,7 @@
 """The table of docs/explanation/method.md on motion without commands, of the twin.
 
-``nice .venv/bin/python docs/motion_tables.py`` prints it as Markdown; it takes some minutes of CPU.
+``nice .venv/bin/python studies/motion_tables.py`` prints it as Markdown; it takes some minutes of
+CPU.
 
 The twin runs each gait once. Its true joint angles, without the commands, are read at the times of
 another log (each joint's own, jittered, at another rate) and get noise: as often as there are

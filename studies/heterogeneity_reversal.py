@@ -8,8 +8,8 @@ The robot is its own mirror image, so the reversed wave is the wave read from ta
 floor that falls the other way along the body. That relation gives the reversed wave of single
 modules; it is checked on runs, and the runs of identical modules and of joint05 need it not.
 
-``.venv/bin/python docs/heterogeneity_reversal.py`` prints the tables; ``--profiles FOLDER`` keeps
-the profiles.
+``.venv/bin/python studies/heterogeneity_reversal.py`` prints the tables; ``--profiles FOLDER``
+keeps the profiles.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The figures of docs/explanation/heterogeneity.md: level and power of the reversal test.
 
-``.venv/bin/python docs/heterogeneity_tables.py`` prints them; it takes about two minutes, most of
-it for eight runs of the 25-joint twin. With ``--quick`` few draws and one weakened servo, only to
-see that it runs.
+``.venv/bin/python studies/heterogeneity_tables.py`` prints them; it takes about two minutes, most
+of it for eight runs of the 25-joint twin. With ``--quick`` few draws and one weakened servo, only
+to see that it runs.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The figures of docs/how-to/compensation.md: spread, speed and cost before and after compensation.
 
-``nice .venv/bin/python docs/compensation_tables.py 5 13`` prints those of chains with so many yaw
-joints, ``13:1.5`` those with servos of 1.5 N m instead of 0.25 N m. Each takes 4 m + 9 runs for the
-kicks, of 18 s, and some 50 more: two to four minutes. ``--quick`` takes 3 yaw joints.
+``nice .venv/bin/python studies/compensation_tables.py 5 13`` prints those of chains with so many
+yaw joints, ``13:1.5`` those with servos of 1.5 N m instead of 0.25 N m. Each takes 4 m + 9 runs for
+the kicks, of 18 s, and some 50 more: two to four minutes. ``--quick`` takes 3 yaw joints.
 
 What is compensated is driven again with other noise and from other phases of the gait than were
 used; so are gaits near it and further off, with the same change of the commands.

@@ -5,7 +5,7 @@ Every module but the middle one in turn, its servo weakened: by 20, 10 or 5 % in
 ground drawn at random. The twin's noise is on the encoders only, so the two runs of a case are made
 once, and the noise of 6 + 6 runs is drawn 100 times.
 
-``.venv/bin/python docs/heterogeneity_naming.py`` prints it; it takes a quarter of an
+``.venv/bin/python studies/heterogeneity_naming.py`` prints it; it takes a quarter of an
 hour of one core. ``--quick``: one module of one chain of 13 joints, only to see that it runs.
 """
 
