@@ -8,7 +8,7 @@ from .estimate import Estimate
 
 TWIN_ACCURACY = (0.86, 0.93)
 """How often it is right in the twin: the least and the largest mean, over gaits that lift links, of
-the shares of contacts and of lifted links that are recognised (``docs/contact_tables.py``)."""
+the shares of contacts and of lifted links that are recognised (``studies/contact_tables.py``)."""
 
 
 @dataclass(frozen=True)
