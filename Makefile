@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures pages \
+.PHONY: help demo test slow clock zoo campaign study check format bench docs schemas pictures pages \
   pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
@@ -65,11 +65,14 @@ define tests
 	exit $$((first + second + third))
 endef
 
-test: $(READY)  ## all tests but the slow ones
-	$(call tests,"not slow")
+test: $(READY)  ## all tests but the slow ones and those of real time
+	$(call tests,"not slow and not clock")
 
 slow: $(READY)  ## the slow tests
-	$(call tests,slow)
+	$(call tests,"slow and not clock")
+
+clock: $(READY)  ## the tests of real time, one after the other, beside a witness of how late it is
+	$(BIN)/python -m pytest -m clock
 
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)

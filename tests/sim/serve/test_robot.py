@@ -172,9 +172,7 @@ def test_commands_in_steps_are_the_same_in_process(scenario):
     assert len(np.unique(commands[:, 0])) > 20
 
 
-@pytest.mark.clock(
-    0.02, "the robot, python-can and the kernel's buffers run on the computer's clock"
-)
+@pytest.mark.clock(0.02, "python-can and the kernel's buffers run on the computer's clock")
 def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, running):
     live = running(scenario.changed(duration_s=0.3), fast=False, wait=True)
     started_ns = live.pacer.now_ns()
@@ -260,7 +258,7 @@ def test_a_twin_that_is_little_late_catches_up(work_s):
             simulated.clock.sleep(wait_s)
         pacer.begin(tick)
         now_ns = pacer.clock_ns(tick * PERIOD_NS)
-        assert pacer.now_ns() - PATIENCE_NS <= now_ns <= pacer.now_ns()
+        assert pacer.now_ns() - PATIENCE_NS <= now_ns < pacer.now_ns() + 1000  # whole us
         assert tick == 0 or now_ns >= before + PERIOD_NS
         before = now_ns
         simulated.pass_s(work)
