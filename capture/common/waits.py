@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+from .clock import REAL, Clock
 from .errors import NoAnswerError
 
 LIMIT_S = 120.0
@@ -34,15 +34,17 @@ _Result = TypeVar("_Result")
 class Standstill:
     """Time without progress, as looks at it find it."""
 
-    def __init__(self, limit_s: float) -> None:
+    def __init__(self, limit_s: float, clock: Clock = REAL) -> None:
         """Begin now.
 
         Args:
             limit_s: Time without progress that is allowed [s].
+            clock: Tells the time of each look.
         """
+        self._clock = clock
         self.limit_s = limit_s
         self._progress: object = None
-        self._still_s, self._looked_s = 0.0, time.monotonic()
+        self._still_s, self._looked_s = 0.0, clock.monotonic_ns() * 1e-9
 
     def reached(self, progress: object = None) -> bool:
         """Look; return whether the limit is reached.
@@ -50,7 +52,7 @@ class Standstill:
         Args:
             progress: Anything that changes with progress.
         """
-        now_s = time.monotonic()
+        now_s = self._clock.monotonic_ns() * 1e-9
         self._still_s += min(now_s - self._looked_s, _MOST_S)
         self._looked_s = now_s
         if progress != self._progress:

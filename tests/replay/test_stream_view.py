@@ -175,6 +175,7 @@ def test_a_viewer_that_is_killed_is_reported(shown):
     assert shown.finish() == (1, "", "error: the Rerun viewer was ended by signal 9\n")
 
 
+@pytest.mark.clock(0.5, "memory is watched for as long as a frozen viewer's socket takes to fill")
 def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(shown):
     viewer = viewer_of(shown)
     freeze(viewer)

@@ -2,24 +2,15 @@
 
 import os
 import signal
-import time
-from pathlib import Path
 
 import pytest
 
 from support.processes import freeze, python_started, wait_for
+from support.simulated_clock import SimulatedClock
 from undulog.capture.common import waits
 from undulog.capture.common.errors import NoAnswerError, UndulogError
-from undulog.capture.common.waits import attended, end_process, processor_time
+from undulog.capture.common.waits import Standstill, attended, end_process, processor_time
 
-STOPPED = """
-import os, signal, time
-from undulog.capture.common.waits import Standstill
-still = Standstill(3.0)
-began = time.monotonic()
-os.kill(os.getpid(), signal.SIGSTOP)
-print(time.monotonic() - began > 3.0, still.reached(), flush=True)
-"""
 TRACER = """
 import ctypes, os, sys, time
 libc = ctypes.CDLL(None, use_errno=True)
@@ -73,14 +64,15 @@ def test_a_look_can_end_a_wait(silent):
         attended(silent, "it", "wait", look=look)
 
 
-@pytest.mark.slow
 def test_time_in_which_the_process_itself_was_stopped_does_not_count():
-    with python_started(STOPPED) as process:
-        stat = Path(f"/proc/{process.pid}/stat")
-        wait_for(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "it to stop")
-        time.sleep(3.5)
-        process.send_signal(signal.SIGCONT)
-        assert process.stdout.readline() == "True False\n"
+    simulated = SimulatedClock()
+    still = Standstill(3.0, simulated.clock)
+    for stopped_s, reached in ((600.0, False), (0.5, False), (1e6, False), (0.5, True)):
+        simulated.pass_s(stopped_s)
+        assert still.reached() is reached
+    assert not still.reached("progress")
+    simulated.pass_s(2.9)
+    assert not still.reached("progress")  # a second of it, for all that is known
 
 
 def test_a_process_that_ignores_the_request_is_killed():

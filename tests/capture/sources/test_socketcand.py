@@ -3,7 +3,6 @@
 import socket
 import sys
 import threading
-import time
 
 import can
 import numpy as np
@@ -37,10 +36,10 @@ def messages(frames, blank=""):
 class Server:
     """Serves a stream to each client that asks for can0 in raw mode."""
 
-    def __init__(self, port=0, hello=b"< hi >", pause_s=0.0):
+    def __init__(self, port=0, hello=b"< hi >", go=None):
         self.listener = socket.create_server(("127.0.0.1", port))
         self.port = self.listener.getsockname()[1]
-        self.hello, self.pause_s = hello, pause_s
+        self.hello, self.go = hello, go
         self.stream = b""
         self.pieces = []
         self.requests = []
@@ -70,7 +69,8 @@ class Server:
                 client.sendall(b"< error could not open bus >")
                 return
             client.sendall(b"< ok >")
-        time.sleep(self.pause_s)
+        if self.go is not None:
+            self.go.wait()
         at = 0
         for size in [*self.pieces, len(self.stream)]:
             client.sendall(self.stream[at : at + size])
@@ -119,9 +119,10 @@ def test_many_frames_and_their_times_to_the_microsecond(serve, listen, blank):
 
 def test_python_cans_own_client_reads_the_same(serve, listen):
     truth = traffic(20_000, remote_share=0)  # it has no remote requests
-    server = serve(pause_s=0.3)  # it can't bear frames right behind the last answer
+    server = serve(go=threading.Event())  # it can't bear frames right behind the last answer
     server.stream = messages(truth)
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=server.port, channel="can0")
+    server.go.set()
     theirs, frames = received(bus, len(truth))
     bus.shutdown()
     found = listen(source_at(server.port)).until_frames(len(truth))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import signal
-import time
 from collections import defaultdict
 from pathlib import Path
 
@@ -195,8 +194,7 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     process = start(*UNDULOG, "drive", "flat", "--on", "twin", "-o", path, "--duration", "3600")
     request.addfinalizer(process.kill)
     unfinished = tmp_path / "stopped.mcap.part"
-    wait_for(lambda: unfinished.exists() and unfinished.stat().st_size > 0, alive=[process])
-    time.sleep(1.0)
+    wait_for(lambda: unfinished.exists() and unfinished.stat().st_size > 200_000, alive=[process])
     process.send_signal(number)
     shown, complained = process.communicate(timeout=60)
     assert (process.returncode, complained) == (0, "")

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -145,8 +144,7 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     with served("flat", "--lockstep", "--fast") as (on, _):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
         with process(*UNDULOG, *words, env=alone) as driving:
-            wait_for(lambda: part.exists() and part.stat().st_size > 0, alive=[driving])
-            time.sleep(1.0)
+            wait_for(lambda: part.exists() and part.stat().st_size > 200_000, alive=[driving])
             driving.send_signal(number)
             shown, complained = driving.communicate(timeout=60)
     assert driving.returncode == 1

@@ -35,6 +35,7 @@ def served(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.clock(0.1, "the vendor's SDK waits by the computer's clock")
 def test_the_vendors_sdk_drives_it_and_a_second_adapter_records_it(tmp_path, served):
     _, ready = served
     log = tmp_path / "run.mcap"

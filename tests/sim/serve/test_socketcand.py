@@ -2,7 +2,6 @@
 
 import socket
 import threading
-import time
 from contextlib import ExitStack, contextmanager
 
 import can
@@ -26,6 +25,7 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
+from undulog.capture.recorder.status import SessionClock
 from undulog.capture.sources.contract import SourceContext, open_source, parse_address, records
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
@@ -46,19 +46,17 @@ class Serving:
         )
         self.port = self.server.address[1]
         self.bus = socketcand_server.VirtualBus(self.server, None, lambda *_: None)
-        self.lock, self.ended = threading.Lock(), False
+        self.lock = threading.Lock()
         self.pulling = True
         self.pulled = []
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
+        self.serving = ExitStack()
+        self.serving.enter_context(repeating(self.serve, 0.0005))
 
-    def run(self):
-        while not self.ended:
-            with self.lock:
-                self.bus.wait(0.005)
-                if self.pulling and (sent := self.bus.pull()):
-                    self.pulled.append(self.bus.relay(sent, 12_345_678_000))
-            time.sleep(0.0005)
+    def serve(self):
+        with self.lock:
+            self.bus.wait(0.005)
+            if self.pulling and (sent := self.bus.pull()):
+                self.pulled.append(self.bus.relay(sent, 12_345_678_000))
 
     def send(self, frames):
         with self.lock:
@@ -72,8 +70,7 @@ class Serving:
             return sum(client.raw for client in self.server._clients.values())
 
     def close(self):
-        self.ended = True
-        self.thread.join()
+        self.serving.close()
         self.bus.close()
 
 
@@ -184,8 +181,9 @@ def test_frames_go_to_everyone_but_their_sender(serving):
 def test_our_own_source_records_the_bus(serving, tmp_path):
     own, other = traffic(300, 0), traffic(100, 0)
     source = open_source(parse_address(f"can:socketcand:can0?port={serving.port}"))
-    with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=time.time_ns()) as writer:
-        source.start(SourceContext(time.monotonic_ns, writer))
+    clock = SessionClock()
+    with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=clock.epoch_ns) as writer:
+        source.start(SourceContext(clock.now_ns, writer))
         try:
             wait_for(lambda: serving.raw() == 1, "our source")
             arrays = []
@@ -275,7 +273,9 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
         thread = threading.Thread(target=sock.sendall, args=(text.encode(),))
         thread.start()
         wait_for(lambda: serving.bus.waiting >= socketcand_server.MOST_SENT, "a full queue")
-        time.sleep(0.2)
+        for _ in range(20):
+            with serving.lock:
+                serving.bus.wait(0.0)
         assert serving.bus.waiting < socketcand_server.MOST_SENT + 2000
         with serving.lock:
             serving.pulling = True
@@ -284,7 +284,10 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
     assert same(serving.frames(), many)
 
 
-def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(serving):
+def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
+    serving, monkeypatch
+):
+    monkeypatch.setattr(socketcand_server, "HOLD_S", 0.0)
     own = traffic(40, 0)
     with serving.lock:
         serving.pulling = False
@@ -292,7 +295,6 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
         serving.server.mark(0)
     address = parse_address(f"can:socketcand:can0?port={serving.port}")
     link = find_virtual_robot(address, Tally(lambda: 0))
-    time.sleep(2 * socketcand_server.HOLD_S)
     with serving.lock:  # the robot does not listen
         # It sent more than the controller has read, so that the end resets the connection; and it
         # sends again before it listens.
