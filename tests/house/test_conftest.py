@@ -84,7 +84,10 @@ def test_nightly(): pass
 def copy_conftest(folder):
     """Copy what limits tests to a folder of its own."""
     (folder / "support").mkdir()
-    for name in ("conftest.py", "support/watcher.py"):
+    for name in (
+        "conftest.py",
+        *(f"support/{n}.py" for n in ("watcher", "clock_tests", "witness")),
+    ):
         shutil.copy(ROOT / "tests" / name, folder / name)
 
 

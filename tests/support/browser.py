@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import time
 
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
@@ -20,8 +19,8 @@ class Browser:
     """A headless Chromium, controlled by the DevTools protocol over a pair of pipes."""
 
     def __init__(self, path, profile, patience_s=60.0, flags=FLAGS):
-        self.patience_s = patience_s
         self._ours, theirs = socket.socketpair()
+        self._ours.settimeout(patience_s)
         fd = theirs.fileno()
         # The protocol is spoken on descriptors 3 (to Chromium) and 4 (from it).
         shell = f'exec 3<&{fd} 4>&{fd}; exec "$@"'
@@ -49,9 +48,8 @@ class Browser:
         if self._session is not None:
             message["sessionId"] = self._session
         self._ours.sendall(json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + self.patience_s
         while True:
-            answer = self._receive(deadline)
+            answer = self._receive()
             if answer.get("id") != self._number:
                 self.events.append(answer)
             elif "error" in answer:
@@ -61,9 +59,8 @@ class Browser:
 
     def wait_for(self, event):
         """Wait for an event that has not been seen since ``open``."""
-        deadline = time.monotonic() + self.patience_s
         while not any(e.get("method") == event for e in self.events):
-            self.events.append(self._receive(deadline))
+            self.events.append(self._receive())
 
     def open(self, url, *, width=1280, height=900, dark=False, media="", scripts=True):
         """Load a page and wait until it is drawn; forgets earlier events."""
@@ -116,12 +113,8 @@ class Browser:
         self._process.wait()
         self._ours.close()
 
-    def _receive(self, deadline):
+    def _receive(self):
         while b"\0" not in self._buffer:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise TimeoutError(f"no answer of Chromium for {self.patience_s} s")
-            self._ours.settimeout(left)
             data = self._ours.recv(1 << 16)
             if not data:
                 raise RuntimeError(f"Chromium ended, exit code {self._process.wait()}")

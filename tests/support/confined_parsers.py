@@ -2,8 +2,8 @@
 
 import ctypes
 import os
+import signal
 import sys
-import time
 from itertools import count
 from pathlib import Path
 
@@ -81,7 +81,7 @@ def turn(path, send):
 
 def sleep(path, send):
     send(Packet({"pid": os.getpid()}))
-    time.sleep(1000)
+    signal.pause()
 
 
 def write(path, send, target, length):

@@ -5,7 +5,6 @@ import json
 import socket
 import subprocess
 import sys
-import time
 
 from support.processes import process, repeating, wait_for
 from undulog.capture.common.errors import DataError
@@ -54,14 +53,17 @@ def drain(server, client, count):
     """Poll and read until so many reply lines have come."""
     data = b""
     client.setblocking(False)
-    deadline = time.monotonic() + PATIENCE_S
-    while data.count(b"\n") < count:
-        assert time.monotonic() < deadline
+
+    def enough():
+        nonlocal data
         server.poll()
         with contextlib.suppress(BlockingIOError):
             got = client.recv(65536)
             assert got, "the server let go"
             data += got
+        return data.count(b"\n") >= count
+
+    wait_for(enough, "the replies")
     client.settimeout(PATIENCE_S)
     return replies(data)
 

@@ -193,7 +193,7 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
 @pytest.mark.parametrize("left", [None, b""], ids=["missing", "empty"])
 def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     path = tmp_path / "run.mcap"
-    killed_after([sys.executable, recorder.__file__, str(path), "{}"], 0.3)
+    killed_after([sys.executable, recorder.__file__, str(path), "{}"], 300)
     part = unfinished_path(path)
     part.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
     if left is not None:

@@ -75,9 +75,9 @@ def check_killed(path, accepted):
     [(0, None, 0), (1, None, 0), (2, 1 << 18, 0), (3, None, 700)],
 )
 def test_a_killed_session_reads_as_if_it_had_been_closed(path, run, split_size, split_every):
-    seconds = random.Random(run).uniform(0.1, 0.8)
+    least = random.Random(run).randrange(1500, 20_000)
     accepted = killed_after(
-        child_command(path, split_size=split_size, split_every=split_every), seconds
+        child_command(path, split_size=split_size, split_every=split_every), least
     )
     warnings = check_killed(path, accepted)
     assert "the recorder did not finish" in warnings[0]
@@ -100,8 +100,8 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
             path.parent.mkdir()
             options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
             options["split_every"] = rng.choice([0, 0, 300])
-            command, seconds = child_command(path, **options), rng.uniform(0.0, 1.5)
-            killed.append((path, killer.submit(killed_after, command, seconds)))
+            command, least = child_command(path, **options), rng.randrange(1, 30_000)
+            killed.append((path, killer.submit(killed_after, command, least)))
         for path, accepted in killed:
             warnings = check_killed(path, accepted.result())
             assert any("none is missing" in text for text in warnings)

@@ -59,7 +59,7 @@ def slow_kill(run):
 def test_a_kill_loses_no_accepted_message(tmp_path, run, segment_size, release):
     folder = tmp_path / "w"
     command = [sys.executable, "-c", KILLED, str(folder), str(segment_size), release]
-    accepted = killed_after(command, random.Random(run).uniform(0.0, 0.5))
+    accepted = killed_after(command, random.Random(run).randrange(1, 20_000))
     recovery = recover(folder)
     positions = check_messages(list(recovery))
     assert recovery.missing == 0
