@@ -1,5 +1,6 @@
 """Tests of real time: how they are judged, and that no other test reads a clock."""
 
+import ast
 import sys
 
 import pytest
@@ -76,3 +77,137 @@ def test_lateness_is_what_was_waited_within_a_second(wait_s):
         late.add(number * 0.25, wait_s)
     assert late.longest_s == pytest.approx(0.5 if wait_s == 0.1 else 0.0)
     assert WINDOW_S == 1.0
+
+
+# -- no other test reads a clock -------------------------------------------------------------------
+
+CLOCKS = {
+    "clock_gettime", "clock_gettime_ns", "monotonic", "monotonic_ns", "perf_counter",
+    "perf_counter_ns", "process_time", "process_time_ns", "sleep", "thread_time", "thread_time_ns",
+    "time", "time_ns",
+}  # fmt: skip
+WAITS = {"wait", "join", "poll", "select"}
+LEAST_LIMIT_S = 10.0
+"""A shorter limit of a wait is a time that something is given, not one after which a test fails."""
+MOST_CLOCK_TESTS = 40
+EXEMPT = {
+    "conftest.py": "limits every test",
+    "campaign": "attacks at random moments",
+    "zoo": "faults at all times",
+    "support/watcher.py": "limits every test",
+    "support/witness.py": "measures how late the computer is",
+    "support/processes.py": "waits for events: wait_for",
+    "support/far_end.py": "a robot and a router that keep to time, as processes",
+    "support/bus_listener.py": "a listener that keeps time, as a process",
+    "support/gate_stage.py": "waits for a quiet bus",
+    "support/recorders.py": "a sender that keeps a pace",
+    "support/serial_lines.py": "a line that keeps its baud rate",
+}
+
+
+def reads_a_clock(node):
+    """Whether code calls a clock, sleeps, or waits for a short time."""
+    for one in ast.walk(node):
+        if isinstance(one, ast.Attribute) and one.attr in CLOCKS:
+            if isinstance(one.value, ast.Name) and one.value.id == "time":
+                return True
+        elif isinstance(one, ast.ImportFrom) and one.module == "time":
+            return True
+        elif isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute):
+            limits = [*one.args, *(word.value for word in one.keywords if word.arg == "timeout")]
+            if one.func.attr in WAITS and any(is_short(limit) for limit in limits):
+                return True
+    return False
+
+
+def is_short(node):
+    """Whether it is a time, and a short one; 0 is no wait."""
+    if not isinstance(node, ast.Constant) or not isinstance(node.value, int | float):
+        return False
+    return not isinstance(node.value, bool) and 0 < node.value < LEAST_LIMIT_S
+
+
+def is_clock(nodes):
+    """Whether one of some expressions is the mark of a test of real time."""
+    return any("mark.clock(" in ast.unparse(node) for node in nodes)
+
+
+def looked_at(path):
+    """Return the tests of a module that are marked, and what reads a clock without a mark.
+
+    A helper, class or fixture may read one if all that name it are marked.
+    """
+    body = ast.parse(path.read_text()).body
+    named = {one.name: one for one in body if isinstance(one, ast.FunctionDef | ast.ClassDef)}
+    marks = [
+        one.value
+        for one in body
+        if isinstance(one, ast.Assign) and "pytestmark" in map(ast.unparse, one.targets)
+    ]
+    marked = {name for name, one in named.items() if is_clock([*marks, *one.decorator_list])}
+    tests = {name for name in named if name.startswith("test_")}
+    tainted = {name for name, one in named.items() if reads_a_clock(one)}
+    others = [one for one in body if one not in named.values()]
+    wrong = {"the module" for one in others if reads_a_clock(one)}
+    while True:
+        users = {
+            name
+            for name, one in named.items()
+            if name not in marked and names_of(one) & (tainted - tests)
+        }
+        if users <= tainted:
+            break
+        tainted |= users
+    helpers = tainted - tests - names_of(*(named[name] for name in named if name != ""))
+    return marked & tests, wrong | (tainted & tests - marked) | helpers
+
+
+def names_of(*nodes):
+    """Return the names that code uses, arguments included, which may be fixtures."""
+    return {
+        one.id if isinstance(one, ast.Name) else one.arg
+        for node in nodes
+        for one in ast.walk(node)
+        if isinstance(one, ast.Name | ast.arg)
+    }
+
+
+def test_no_other_test_reads_a_clock():
+    tests, marked, wrong = ROOT / "tests", [], []
+    for path in sorted(tests.rglob("*.py")):
+        name = path.relative_to(tests).as_posix()
+        if not EXEMPT.keys() & {name, name.partition("/")[0]}:
+            of_clock, faults = looked_at(path)
+            marked += [f"{name}::{one}" for one in of_clock]
+            wrong += [f"{name}: {one}" for one in sorted(faults)]
+    assert not wrong
+    assert 0 < len(marked) <= MOST_CLOCK_TESTS
+
+
+def test_the_search_finds_clocks(tmp_path):
+    code = """
+import time, pytest
+
+def pause():
+    time.sleep(0.1)
+
+def held():
+    thread.join(0.5)
+
+def test_patient():
+    process.wait(60)
+
+def test_of_a_helper():
+    pause()
+
+def test_of_no_clock():
+    simulated.sleep(1)
+
+@pytest.mark.clock(0.1, "why")
+def test_marked():
+    held()
+    time.monotonic()
+"""
+    (tmp_path / "test_one.py").write_text(code)
+    marked, wrong = looked_at(tmp_path / "test_one.py")
+    assert (marked, wrong) == ({"test_marked"}, {"test_of_a_helper"})

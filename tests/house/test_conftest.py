@@ -84,10 +84,8 @@ def test_nightly(): pass
 def copy_conftest(folder):
     """Copy what limits tests to a folder of its own."""
     (folder / "support").mkdir()
-    for name in (
-        "conftest.py",
-        *(f"support/{n}.py" for n in ("watcher", "clock_tests", "witness")),
-    ):
+    support = (f"support/{name}.py" for name in ("watcher", "clock_tests", "witness"))
+    for name in ("conftest.py", *support):
         shutil.copy(ROOT / "tests" / name, folder / name)
 
 

@@ -178,7 +178,7 @@ def test_a_tap_passes_bytes_both_ways_unchanged_and_knows_the_direction(tmp_path
         port.writePort(request)
         heard = b""
         while len(heard) < len(request):
-            select.select([line.master], [], [], 5)
+            select.select([line.master], [], [], 60)
             heard += os.read(line.master, 100)
         assert heard == request
         line.send(reply)

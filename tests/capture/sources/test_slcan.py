@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import os
-import select
 import threading
 import tty
 
@@ -12,7 +11,7 @@ import pytest
 from can.util import len2dlc
 
 from support.can_messages import can_message, cut_at_random, fd_traffic, received, same, traffic
-from support.processes import wait_for
+from support.processes import repeating, wait_for
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG
 from undulog.capture.robot.model import ClockDomain
@@ -57,39 +56,38 @@ class Adapter:
         self.queue = b""
         self.lock = threading.Lock()
         self.plugged = True
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
+        os.set_blocking(self.master, False)
+        self.text = b""
+        self.serving = contextlib.ExitStack()
+        self.serving.enter_context(repeating(self.serve, 0.002))
 
     def send(self, data):
         with self.lock:
             self.queue += data
 
-    def run(self):
-        text = b""
-        os.set_blocking(self.master, False)
-        while self.plugged:
-            if select.select([self.master], [], [], 0.002)[0]:
-                text += os.read(self.master, 4096)
-            *commands, text = text.split(b"\r")
-            for command in filter(None, commands):
-                self.commands.append(command)
-                if self.answers:
-                    closed = command == b"C" and not self.opened.is_set()
-                    bad = closed or command[:1] == self.refuses
-                    os.write(self.master, b"\a" if bad else b"\r")
-                if command == b"C":
-                    self.opened.clear()
-                elif command in (b"L", b"O") and command != self.refuses:
-                    self.opened.set()
-            with self.lock:
-                if self.opened.is_set() and self.queue:
-                    with contextlib.suppress(BlockingIOError):
-                        self.queue = self.queue[os.write(self.master, self.queue[:3000]) :]
+    def serve(self):
+        with contextlib.suppress(BlockingIOError):
+            self.text += os.read(self.master, 4096)
+        *commands, self.text = self.text.split(b"\r")
+        for command in filter(None, commands):
+            self.commands.append(command)
+            if self.answers:
+                closed = command == b"C" and not self.opened.is_set()
+                bad = closed or command[:1] == self.refuses
+                os.write(self.master, b"\a" if bad else b"\r")
+            if command == b"C":
+                self.opened.clear()
+            elif command in (b"L", b"O") and command != self.refuses:
+                self.opened.set()
+        with self.lock:
+            if self.opened.is_set() and self.queue:
+                with contextlib.suppress(BlockingIOError):
+                    self.queue = self.queue[os.write(self.master, self.queue[:3000]) :]
 
     def unplug(self):
         if self.plugged:
             self.plugged = False
-            self.thread.join()
+            self.serving.close()
             self.link.unlink(missing_ok=True)
             os.close(self.master)
             os.close(self.slave)

@@ -54,7 +54,7 @@ class Serving:
 
     def serve(self):
         with self.lock:
-            self.bus.wait(0.005)
+            self.bus.wait(0.0)
             if self.pulling and (sent := self.bus.pull()):
                 self.pulled.append(self.bus.relay(sent, 12_345_678_000))
 
