@@ -391,9 +391,10 @@ class DurableSink:
 
     def _misplaced(self) -> str:
         """How the open part or the write-ahead log was deleted or moved; empty if it wasn't."""
+        path = self._part.path
         if (how := self._part.misplaced) != "":
             self._disk.write(self._part, 0)  # at once to a rescue file, if it needs one
-            return f"{self._part.path}: {how}"
+            return f"{path}: {how}"
         if self._wal.place is None:
             return f"{self._wal.folder}: was deleted while it was being written"
         return ""
