@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow clock zoo campaign study check format bench docs schemas pictures pages \
+.PHONY: help demo test slow clock zoo campaign mutants study check format bench docs schemas pictures pages \
   pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
@@ -79,6 +79,9 @@ zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=
 
 campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=2000 for fewer)
 	PYTHONPATH=tests:bench:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
+
+mutants: $(READY)  ## 210 small faults in the product: do the fast tests find them? resumable (SEED=2 COUNT=20)
+	PYTHONPATH=tests nice -n 5 $(BIN)/python -m mutants.run $(and $(SEED),--seed $(SEED)) $(and $(COUNT),--count $(COUNT))
 
 study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
 	$(BIN)/python studies/study/study.py $(if $(LONG),,--quick)

@@ -94,6 +94,7 @@ EXEMPT = {
     "conftest.py": "limits every test",
     "campaign": "attacks at random moments",
     "zoo": "faults at all times",
+    "mutants": "limits the tests of each mutant",
     "support/watcher.py": "limits every test",
     "support/witness.py": "measures how late the computer is",
     "support/processes.py": "waits for events: wait_for",
