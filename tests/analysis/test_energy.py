@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from undulog.analysis.energy import add_up, integrate, power_of
+from undulog.analysis.energy import _distance, _ratio, add_up, integrate, power_of
 from undulog.analysis.estimators.series import Series, clean, coverage, sample_weights
 from undulog.capture.log.read.sample_times import Signal
 
@@ -119,3 +120,22 @@ def test_a_lost_message_is_a_gap_of_one_interval():
     np.testing.assert_allclose(energy.covered, energy.net_j)
     assert energy.coverage == pytest.approx(7.97 / 8)
     assert (add_up(net, lost[1], -3.0, 5.0, 8), add_up(net, plus, 6.0, 7.0, 1)) == (None, None)
+
+
+@pytest.mark.parametrize("cycles", [2, 5, 60])
+def test_a_distance_has_the_interval_of_a_sum_of_normal_steps(cycles):
+    way = np.random.default_rng(cycles).normal(0.02, 0.005, cycles)
+    distance = _distance(way)
+    expected = stats.t.interval(0.95, cycles - 1, way.mean(), stats.sem(way))
+    assert distance.value == pytest.approx(cycles * way.mean())
+    np.testing.assert_allclose(distance.ci95, cycles * np.array(expected), rtol=1e-9)
+
+
+def test_the_interval_of_a_ratio_holds_the_ratio_as_often_as_it_says():
+    rng, held, draws = np.random.default_rng(2), 0, 2000
+    for _ in range(draws):
+        below = rng.normal(1.0, 0.2, 40)
+        above = 0.7 * below + rng.normal(0.0, 0.1, 40)
+        low, high = _ratio(above, below).ci95
+        held += low <= 0.7 <= high
+    assert held / draws == pytest.approx(0.95, abs=0.016)  # three standard errors

@@ -111,6 +111,17 @@ def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
     assert command[1] == command[2] == 0.3  # untouched, bit by bit
 
 
+@pytest.mark.parametrize(
+    ("current", "share"), [(0.999, 1.0), (-0.999, 1.0), (1.001, 0.8), (-1.001, 0.8), (np.nan, 1.0)]
+)
+def test_a_servo_gives_way_from_its_limit_on(current, share):
+    yielding = CurrentLimiter(np.array([1.0]))
+    command = yielding.apply(np.array([0.3]), np.array([0.1]), np.array([current]))
+    assert command[0] == pytest.approx(0.1 + share * 0.2, abs=1e-15)
+    again = yielding.apply(np.array([0.3]), np.array([0.1]), np.array([0.5]))
+    assert again[0] == pytest.approx(0.1 + min(share + 0.02, 1.0) * 0.2, abs=1e-15)
+
+
 def test_no_rate_is_beyond_the_servos_own():
     joints = list(ROBOT.joints)
     joints[2] = dataclasses.replace(joints[2], max_velocity=0.3)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from support.bus_robots import bus_robot
 from undulog.capture import load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
@@ -103,3 +104,29 @@ def test_frames_of_others_are_counted_and_give_no_reading(known):
     known.add(frames, 0.0)
     assert (known.status(1.0).silence_s == math.inf).all()
     assert (known.tally.frames, known.tally.decoded) == (2, 0)
+
+
+FLOATS = """
+VERSION ""
+BU_: a b
+
+BO_ 5 angle: 4 a
+ SG_ radians : 0|32@1- (1,0) [0|0] "rad" b
+
+SIG_VALTYPE_ 5 radians : 1;
+"""
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_a_servo_at_infinity_has_not_replied(value):
+    """A bus with floating-point numbers can have it."""
+    known = BusReadings(bus_robot(FLOATS, [("angle", "radians", "rx", "position", "rad", "")]))
+    frames = empty_frames(1)
+    frames["id_flags"], frames["dlc"] = 5, 4
+    for angle, time_s in ((0.25, 1.0), (value, 1.1)):
+        frames["data"][0, :4] = np.frombuffer(np.float32(angle).tobytes(), np.uint8)
+        known.add(frames, time_s)
+    status = known.status(1.1)
+    assert status.angle.tolist() == [0.25]
+    assert status.silence_s[0] == pytest.approx(0.1)
+    assert known.angles.tolist() == [1]
