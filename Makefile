@@ -55,24 +55,30 @@ COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/tes
   $(addprefix tests/replay/,calibrate draw overlay sweep) \
   $(addprefix tests/replay/test_,clip.py reproduce.py) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
+PYTEST = $(BIN)/python -m pytest --durations 20
+# JUnit files, with the seconds of each test, lie in out/tests/.
 define tests
-	@logs=$$(mktemp -d); \
-	nice -n 5 $(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(ANALYSIS) >$$logs/1 2>&1 & first=$$!; \
-	nice -n 5 $(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$logs/2 2>&1 & second=$$!; \
+	@mkdir -p out/tests; logs=$$(mktemp -d); \
+	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-analysis.xml \
+	  $(ANALYSIS) >$$logs/1 2>&1 & first=$$!; \
+	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-computing.xml \
+	  $(COMPUTING) >$$logs/2 2>&1 & second=$$!; \
 	trap "kill $$first $$second; rm -rf $$logs; exit 130" INT TERM; \
-	$(BIN)/python -m pytest -m $(1) $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING)); third=$$?; \
+	$(PYTEST) -m $(2) --junitxml out/tests/$(1).xml \
+	  $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING)); third=$$?; \
 	wait $$first; first=$$?; wait $$second; second=$$?; cat $$logs/*; rm -rf $$logs; \
 	exit $$((first + second + third))
 endef
 
 test: $(READY)  ## all tests but the slow ones and those of real time
-	$(call tests,"not slow and not clock")
+	$(call tests,test,"not slow and not clock")
 
 slow: $(READY)  ## the slow tests
-	$(call tests,"slow and not clock")
+	$(call tests,slow,"slow and not clock")
 
 clock: $(READY)  ## the tests of real time, one after the other, beside a witness of how late it is
-	$(BIN)/python -m pytest -m clock
+	@mkdir -p out/tests
+	$(PYTEST) -m clock --junitxml out/tests/clock.xml
 
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
