@@ -132,9 +132,8 @@ pages-scripts: $(READY)
 pages-tables: $(READY)
 	$(BUILDING) $(BIN)/python -m pytest -p no:cacheprovider -m built tests --ignore=tests/docs
 
-nightly: $(READY)  ## every script of studies/ in its short form
-	UNDULOG_NIGHTLY=1 UNDULOG_REQUIRE_ALL_TESTS=1 $(BIN)/python -m pytest -p no:cacheprovider \
-	  -m nightly tests
+nightly: $(READY)  ## all that takes long, in parts of an hour at most, resumable (PARTS="zoo pages" for some)
+	$(BIN)/python .ci/nightly.py $(PARTS)
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py
