@@ -47,7 +47,7 @@ PARTS = {
     "clock": Part("make clock", "the tests of real time"),
     "studies": Part(
         "UNDULOG_NIGHTLY=1 .venv/bin/python -m pytest -p no:cacheprovider -m nightly tests",
-        "each script of studies/ in its short form",
+        "each script of studies/ in its short form, fifty kills",
     ),
     "campaign": Part("make campaign", "50,000 attacks with a new seed", resumes=True),
     "mutants": Part("make mutants", "210 planted faults", resumes=True),

@@ -112,6 +112,7 @@ def test_a_killed_recording_has_what_was_accepted(options, tmp_path, command, cy
     check_kill(command, tmp_path, *record_and_kill(cycle, tmp_path, 0, *options))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.clock(0.02, "a recorder that is killed has what was accepted 50 ms before")
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
