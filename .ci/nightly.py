@@ -32,7 +32,7 @@ class Part:
     """A part.
 
     Attributes:
-        command: Run by a shell at the root.
+        command: Run by a shell at the root; COMMIT stands for the commit.
         guards: What it is for.
         resumes: Whether it goes on where it was after an interrupt.
     """
@@ -49,13 +49,21 @@ PARTS = {
         "UNDULOG_NIGHTLY=1 .venv/bin/python -m pytest -p no:cacheprovider -m nightly tests",
         "each script of studies/ in its short form, fifty kills",
     ),
-    "campaign": Part("make campaign", "50,000 attacks with a new seed", resumes=True),
-    "mutants": Part("make mutants", "210 planted faults", resumes=True),
+    "campaign": Part(
+        "PYTHONPATH=tests:bench:. .venv/bin/python -m campaign.run -o out/nightly/COMMIT/campaign",
+        "50,000 attacks with a new seed",
+        resumes=True,
+    ),
+    "mutants": Part(
+        "PYTHONPATH=tests .venv/bin/python -m mutants.run -o out/nightly/COMMIT/mutants",
+        "210 planted faults",
+        resumes=True,
+    ),
     "zoo": Part("make zoo", "planted faults of robots, 100 seeds each"),
     "pages": Part("make pages", "the long parts of the manual"),
     "install": Part("make install-paths", "every way to install"),
     "newest": Part(
-        "rm -rf out/nightly/newest && python3.11 -m venv --system-site-packages out/nightly/newest"
+        "rm -rf out/nightly/newest && python3.11 -m venv out/nightly/newest"
         " && out/nightly/newest/bin/pip install -q -r requirements.lock"
         " && out/nightly/newest/bin/pip install -q --no-deps --no-build-isolation -e ."
         " && out/nightly/newest/bin/pip install -q --upgrade rerun-sdk pandas"
@@ -81,17 +89,18 @@ class Outcome:
     last: str
 
 
-def run(name: str, before: Outcome | None) -> Outcome:
+def run(name: str, before: Outcome | None, this: str) -> Outcome:
     """Run a part; its output goes to a file.
 
     Args:
         before: Its outcome so far.
+        this: The commit: cases of another one say nothing of it.
     """
     part, log = PARTS[name], FOLDER / f"{name}.log"
     began = time.monotonic()
     with log.open("ab") as output:
         process = subprocess.Popen(  # noqa: S602  our own commands
-            part.command,
+            part.command.replace("COMMIT", this),
             shell=True,
             cwd=ROOT,
             env=os.environ | ALL,
@@ -156,7 +165,7 @@ def main() -> int:
             if name in outcomes and outcomes[name].state == "passed":
                 continue
             print(f"{time.strftime('%H:%M')} {name}: {PARTS[name].command}", flush=True)  # noqa: T201
-            outcomes[name] = run(name, outcomes.get(name))
+            outcomes[name] = run(name, outcomes.get(name), this)
             state.write_text(json.dumps({this: {k: asdict(one) for k, one in outcomes.items()}}))
     except KeyboardInterrupt:
         print("interrupted")  # noqa: T201
