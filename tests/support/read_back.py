@@ -1,8 +1,10 @@
 """Contents of a log: by our reader with its parts and its write-ahead log, or by mcap's reader."""
 
+import struct
 from pathlib import Path
 
 from mcap.reader import make_reader
+from mcap.stream_reader import MAGIC_SIZE
 from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture.log.edited_log import RawLog
@@ -23,6 +25,17 @@ def messages_of(path, **options):
     """Schema, channel and message of all messages of one file, by mcap's reader."""
     with path.open("rb") as stream:
         return list(make_reader(stream, validate_crcs=True).iter_messages(**options))
+
+
+def opcodes_so_far(path):
+    """The kinds of all whole records of a file that is still being written."""
+    data, at, found = path.read_bytes(), MAGIC_SIZE, []
+    while at + 9 <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        at += 9 + length
+        if at <= len(data):
+            found.append(opcode)
+    return found
 
 
 def decoded_of(path, topics=None):
