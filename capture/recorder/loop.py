@@ -7,11 +7,9 @@ Tasks of once a second are spread over the second's ticks, so that no tick is lo
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from select import select
 
 import numpy as np
 
@@ -107,6 +105,7 @@ class Recorder:
 
         Args:
             writer: The session; the recorder doesn't close it.
+            clock: Of the session, and of the ticks.
             decoded: The source that is the robot's bus; None to decode no frames.
             each_tick: Called at the end of every tick.
             each_second: Called once a second, in different ticks.
@@ -120,11 +119,12 @@ class Recorder:
         self.buses: dict[str, BusRecorder] = {}
         self.links: dict[str, SourceLink] = links_of(sources)
         self._writer, self._clock, self._context = writer, clock, context
+        self._time = clock.clock
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
         tasks = (self._write_clocks, self._log_unknown_frames, lambda: gc.collect(1), *each_second)
-        self._each_second = EachSecond(tasks, time.monotonic_ns())
+        self._each_second = EachSecond(tasks, self._time.monotonic_ns())
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
         self._received = 0  # frames in the last poll
@@ -176,7 +176,7 @@ class Recorder:
                 _manual_collection()
             ):  # first: it takes long, and the buffers of sources that listen fill
                 self._start()
-                self._pauses = PauseWatch(time.monotonic_ns(), lambda: stop.continued)
+                self._pauses = PauseWatch(self._time.monotonic_ns(), lambda: stop.continued)
                 with self._urgent():
                     self._loop(stop, duration_s, self._pauses)
                     self._catch_up(self._pauses)
@@ -221,11 +221,11 @@ class Recorder:
             yield
 
     def _loop(self, stop: StopRequest, duration_s: float | None, pauses: PauseWatch) -> None:
-        begun_ns = due_ns = time.monotonic_ns()
+        begun_ns = due_ns = self._time.monotonic_ns()
         end_ns = None if duration_s is None else begun_ns + round(duration_s * _NS)
         tick = planned_ns = 0
         while self.ending is None:
-            now_ns = time.monotonic_ns()
+            now_ns = self._time.monotonic_ns()
             pauses.look(now_ns, planned_ns)
             self._tick(tick, now_ns)
             if stop.signal is not None:
@@ -234,7 +234,7 @@ class Recorder:
                 self.ending = Ending(f"{duration_s:g} s are over")
             elif all(source.finished or source.name in self._failed for source in self._sources):
                 self.ending = Ending("all sources have ended", failed=bool(self._failed))
-            after_ns = time.monotonic_ns()
+            after_ns = self._time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
             pauses.look(after_ns)
             self._report_pauses(pauses)
@@ -242,7 +242,7 @@ class Recorder:
             due_ns = after_ns + _PAUSE_NS if self._received >= _PRESSED else due_ns + TICK_NS
             planned_ns = max(0, due_ns - after_ns)
             if planned_ns:
-                select([], [], [], planned_ns / _NS)
+                self._time.sleep(planned_ns / _NS)
             elif after_ns > due_ns + _NS:  # stopped for a while: left-out ticks are not repeated
                 self.overruns += (after_ns - due_ns) // TICK_NS
                 due_ns = after_ns
@@ -270,12 +270,12 @@ class Recorder:
         """
         if all(isinstance(source, EndingSource) or source.robot for source in self._sources):
             return
-        before_ns = time.monotonic_ns()
+        before_ns = self._time.monotonic_ns()
         left_ns, calm = _CATCH_UP_NS, 0
         while calm < _CALM and left_ns > 0:
-            select([], [], [], TICK_NS / _NS)
+            self._time.sleep(TICK_NS / _NS)
             self._take()
-            now_ns = time.monotonic_ns()
+            now_ns = self._time.monotonic_ns()
             pauses.look(now_ns, TICK_NS)
             left_ns -= min(now_ns - before_ns, 2 * TICK_NS)
             before_ns = now_ns
@@ -307,10 +307,10 @@ class Recorder:
         for source in self._sources:
             if source.name not in self._failed:
                 self._end_source(source)
-        left_ns, before_ns, before = _DRAIN_NS, time.monotonic_ns(), self._from_ended()
+        left_ns, before_ns, before = _DRAIN_NS, self._time.monotonic_ns(), self._from_ended()
         while True:
             self._take()
-            now_ns = time.monotonic_ns()
+            now_ns = self._time.monotonic_ns()
             pauses.look(now_ns)
             count = self._from_ended()
             if count > before:  # the kernel's buffers limit what still comes
@@ -319,7 +319,7 @@ class Recorder:
             before_ns = now_ns
             if left_ns <= 0 or not any(self._has_more(source) for source in self._sources):
                 break
-            select([], [], [], _PAUSE_NS / _NS)
+            self._time.sleep(_PAUSE_NS / _NS)
         self._report_pauses(pauses, ends=True)
 
     def _from_ended(self) -> int:

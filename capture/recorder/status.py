@@ -7,13 +7,13 @@ those of :class:`.capture.log.health.bus_tally.SourceHealth`.
 from __future__ import annotations
 
 import math
-import time
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ..common.arrays import NS
+from ..common.clock import REAL, Clock
 from ..log.health.bus_tally import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.health.rules import GOOD_LOSS, VERDICTS, has_rhythm
 from ..log.messages.definitions import ERROR, OK, STALE, WARN, DiagnosticStatus
@@ -28,15 +28,17 @@ class SessionClock:
     no duration in the session.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = REAL) -> None:
         """Start now."""
-        before = time.monotonic_ns()
-        self.epoch_ns = time.time_ns()
-        self._zero = self.epoch_ns - (before + time.monotonic_ns()) // 2
+        before = clock.monotonic_ns()
+        self.epoch_ns = clock.wall_ns()
+        self._zero = self.epoch_ns - (before + clock.monotonic_ns()) // 2
+        self.clock = clock
+        """What it reads."""
 
     def now_ns(self) -> int:
         """Return the time of the session [Unix ns], which never decreases."""
-        return self._zero + time.monotonic_ns()
+        return self._zero + self.clock.monotonic_ns()
 
 
 class EachSecond:
