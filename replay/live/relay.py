@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from undulog.capture.common.clock import REAL, Clock
 from undulog.capture.common.errors import DataError, NoAnswerError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.common.process import StopRequest, interruptible
@@ -246,15 +247,24 @@ class LiveStream(BoundedStream):
 class Relay:
     """Draws the messages of an inbox; one thread calls it."""
 
-    def __init__(self, inbox: Inbox, connect: Connect, *, one_session: bool = False) -> None:
+    def __init__(
+        self,
+        inbox: Inbox,
+        connect: Connect,
+        *,
+        one_session: bool = False,
+        clock: Clock = REAL,
+    ) -> None:
         """Draw nothing yet.
 
         Args:
             inbox: Where the feed comes in.
             connect: Gives each session's recording stream its sink.
             one_session: Whether to draw the first session only, into a file.
+            clock: Of silences and lags.
         """
         self._inbox, self._connect, self._one_session = inbox, connect, one_session
+        self._clock = clock
         self.ended = False
         """Whether the last session has ended."""
         self._sessions: list[str] = []
@@ -262,7 +272,7 @@ class Relay:
         self._log = LiveLog()
         self._scene: LiveScene | None = None
         self._rec: LiveStream | None = None
-        self._heard_at = time.monotonic()
+        self._heard_ns = clock.monotonic_ns()
         self._complaint = ""
         self._shown = self._refused = 0
         self._unread_before = self._dropped_before = self._dropped = 0
@@ -297,7 +307,7 @@ class Relay:
         """
         pending: list[LiveMessage] = []
         for datagram in self._inbox.take():
-            self._heard_at = time.monotonic()
+            self._heard_ns = self._clock.monotonic_ns()
             if datagram.head.feed_id != self._feed_id:
                 self._draw(pending)
                 if not self._begin(datagram.head.feed_id):
@@ -307,7 +317,8 @@ class Relay:
                 self._draw(pending)
                 self._end()
         self._draw(pending)
-        if not self.ended and self._sessions and time.monotonic() - self._heard_at > SILENCE_S:
+        silent_s = (self._clock.monotonic_ns() - self._heard_ns) * 1e-9
+        if not self.ended and self._sessions and silent_s > SILENCE_S:
             self._end()
 
     def close(self) -> None:
@@ -364,7 +375,7 @@ class Relay:
             self._states.clear()
         self._scene.draw(batch, self._not_shown)
         self._shown += batch.messages
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
         self._lags.extend((now_ns - message.offered_ns) * 1e-9 for message in messages)
         messages.clear()
 
@@ -382,7 +393,7 @@ class Relay:
         send_properties(rec, f"{session_id} live", epoch_ns)
         self._rec = rec
         self._sessions.append(session_id)
-        return LiveScene(rec, self._log, session_id, epoch_ns)
+        return LiveScene(rec, self._log, session_id, epoch_ns, self._clock.monotonic_ns)
 
     def _end(self) -> None:
         if self._scene is not None and not self.ended:

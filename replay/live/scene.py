@@ -7,8 +7,7 @@ of their inputs have been received.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -143,7 +142,12 @@ class LiveScene:
     """One recording as it grows."""
 
     def __init__(
-        self, rec: rr.RecordingStream, log: LiveLog, session_id: str, epoch_ns: int
+        self,
+        rec: rr.RecordingStream,
+        log: LiveLog,
+        session_id: str,
+        epoch_ns: int,
+        now_ns: Callable[[], int],
     ) -> None:
         """Draw nothing yet.
 
@@ -151,7 +155,9 @@ class LiveScene:
             log: What is known of the recording.
             session_id: The session's id.
             epoch_ns: Where ``session_time`` starts [Unix ns].
+            now_ns: Returns the time [ns, monotonic]: facts and layout are sent now and then.
         """
+        self._now_ns = now_ns
         self._rec, self._log, self._session_id = rec, log, session_id
         self._clock = Clock(epoch_ns)
         self._window, self._fresh = _Window(), _Fresh()
@@ -243,7 +249,7 @@ class LiveScene:
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
         """Choose head, middle and tail of the plane that moves, once it is clear which does."""
-        now = time.monotonic()
+        now = self._now_ns() * 1e-9
         if self._places is not None and now < self._places_at:
             return
         self._places_at = now + _PLACES_EVERY_S
@@ -319,7 +325,7 @@ class LiveScene:
 
     def _lay_out(self, dropped: int, *, ended: bool = False) -> None:
         """Send the layout when there is something new to lay out, and the facts."""
-        content, now = self.content, time.monotonic()
+        content, now = self.content, self._now_ns() * 1e-9
         if now >= self._facts_at:
             self._facts_at = now + _FACTS_EVERY_S
             log_facts(self._rec, self._facts(content, dropped, ended=ended))

@@ -17,7 +17,7 @@ WAIT_S = 90
 class Recorder:
     """Sends a session's messages, as a recorder would, but as fast as the relay takes them."""
 
-    def __init__(self, session, socket_path):
+    def __init__(self, session, socket_path, **options):
         with session.open("rb") as stream:
             reader = make_reader(stream)
             summary = reader.get_summary()
@@ -31,7 +31,7 @@ class Recorder:
                 (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
                 for _, _, m in reader.iter_messages()
             ]
-        self.feed = LiveFeed(socket_path)
+        self.feed = LiveFeed(socket_path, **options)
         for one in self.definitions:
             self.feed.define(one)
 

@@ -9,12 +9,13 @@ import pytest
 
 from support.live_stage import EPOCH_NS, WAIT_S, Recorder
 from support.processes import freeze, wait_for
+from support.simulated_clock import SimulatedClock
 from support.written_topics import write_topics
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
 from undulog.capture.recorder.live_feed import spawn_relay
 from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
-from undulog.replay.live.relay import Inbox
+from undulog.replay.live.relay import SILENCE_S, Inbox, Relay
 
 
 @pytest.mark.slow
@@ -174,6 +175,44 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
         assert inbox.dropped > 0
         assert taken[0].head.kind is Kind.DEFINITIONS
         assert sum(len(one.data) for one in taken) <= 150_000
+
+
+def test_a_silent_feed_ends_after_ten_seconds_and_goes_on_when_it_is_heard_again(
+    tmp_path, session_file
+):
+    now = SimulatedClock()
+    connect = lambda rec: rec.save(tmp_path / "live.rrd")  # noqa: E731
+    with Inbox(tmp_path / "s") as inbox:
+        relay = Relay(inbox, connect, clock=now.clock)
+        recorder = Recorder(session_file, tmp_path / "s", clock=now.clock.monotonic_ns)
+
+        def send(start_s, stop_s, late_s):
+            sent = recorder.feed.counts.sent
+            recorder.send(start_s, stop_s, wait=False)
+            now.pass_s(0.05)  # a datagram that isn't full waits for less
+            wait_for(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+            shown = relay.report.shown + recorder.feed.counts.sent - sent
+            now.pass_s(late_s)
+            wait_for(lambda: relay.report.shown == shown, each=relay.step)
+
+        relay.step()
+        assert not relay.ended
+        recorder.connect()
+        send(0.0, 0.3, late_s=0.25)
+        now.pass_s(SILENCE_S)
+        relay.step()
+        assert not relay.ended
+        now.pass_s(0.1)
+        relay.step()
+        assert relay.ended
+        send(0.3, 0.6, late_s=0.0)
+        assert not relay.ended
+        report = relay.report
+        relay.close()
+        recorder.feed.close()
+    assert report.sessions == ("made-for-tests",)
+    assert report.dropped == 0
+    assert 0.25 <= report.lag_s[2] <= 0.31
 
 
 @pytest.mark.slow
