@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow clock zoo campaign mutants study check format bench docs schemas pictures pages \
+.PHONY: help demo test slow night clock zoo campaign mutants study check format bench docs schemas pictures pages \
   pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
@@ -73,8 +73,13 @@ endef
 test: $(READY)  ## all tests but the slow ones and those of real time
 	$(call tests,test,"not slow and not clock")
 
-slow: $(READY)  ## the slow tests
+slow: $(READY)  ## the slow tests of what is promised
 	$(call tests,slow,"slow and not clock")
+
+night: export UNDULOG_NIGHTLY = 1
+night: $(READY)  ## the tests that draw, simulate or repeat for long; golden pictures, studies
+	$(call tests,night,"nightly and not clock")
+	$(PYTEST) -m "nightly and clock" --junitxml out/tests/night-clock.xml
 
 clock: $(READY)  ## the tests of real time, one after the other, beside a witness of how late it is
 	@mkdir -p out/tests

@@ -43,12 +43,9 @@ class Part:
 
 
 PARTS = {
-    "slow": Part("make slow", "the slow tests"),
+    "slow": Part("make slow", "the slow tests of what is promised"),
     "clock": Part("make clock", "the tests of real time"),
-    "studies": Part(
-        "UNDULOG_NIGHTLY=1 .venv/bin/python -m pytest -p no:cacheprovider -m nightly tests",
-        "each script of studies/ in its short form, fifty kills",
-    ),
+    "night": Part("make night", "levels of intervals, long runs of the twin, pictures, studies"),
     "campaign": Part(
         "PYTHONPATH=tests:bench:. .venv/bin/python -m campaign.run -o out/nightly/COMMIT/campaign",
         "50,000 attacks with a new seed",

@@ -107,7 +107,8 @@ def _watch(text=""):
 
 @contextlib.contextmanager
 def _watched(item, phase):
-    usual_s = SLOW_LIMIT_S if item.get_closest_marker("slow") else LIMIT_S
+    is_long = any(map(item.get_closest_marker, ("slow", "nightly")))
+    usual_s = SLOW_LIMIT_S if is_long else LIMIT_S
     limit_s = float(os.environ.get(LIMIT) or usual_s)
     _watch(f"{limit_s} {item.nodeid} ({phase})")
     try:
@@ -137,7 +138,8 @@ def pytest_enter_pdb():
 
 LEFT_OUT = {"built": "UNDULOG_BUILD_PAGES", "nightly": "UNDULOG_NIGHTLY"}
 """Markers of tests that are left out, and the environment variable that lets them in if it is 1:
-the long parts of the manual are for `make pages`, the studies for `make nightly`."""
+the long parts of the manual are for `make pages`, what draws or simulates for long for `make
+nightly`."""
 
 
 def pytest_collection_modifyitems(config, items):

@@ -52,7 +52,7 @@ def test_every_notebook_of_the_gallery_is_tried():
     assert [path.stem for path in notebook_page.GALLERY] == sorted(SHOWN)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("path", notebook_page.GALLERY, ids=lambda path: path.stem)
 def test_a_notebook_of_the_gallery_runs_shows_its_answer_and_leaves_nothing(
     path, tmp_path, monkeypatch

@@ -20,7 +20,7 @@ def test_the_page_names_no_other_folder_than_data():
         assert not any(word.startswith(("/", "~", "..")) for word in words), command
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n")[0].split("/")[-1])
 def test_each_block_of_the_page_is_what_is_printed(block, tmp_path, monkeypatch, command):
     if not SHARED.is_dir():

@@ -22,7 +22,7 @@ SCRIPTS = sorted(
 NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
 """Conclusions of the study that its short form leaves open: too few points or lengths of chains."""
 
-pytestmark = [pytest.mark.slow, pytest.mark.nightly]
+pytestmark = pytest.mark.nightly
 
 
 def shows_the_conclusions_of_the_study(folder, _):

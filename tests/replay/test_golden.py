@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support import golden_pictures
 from undulog.replay.viewer import HeadlessViewer
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 LIMIT = golden_pictures.DIFFERING
 PICTURES = sorted(path.stem for path in golden_pictures.FOLDER.glob("*.png"))

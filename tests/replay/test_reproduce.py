@@ -55,7 +55,7 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     assert f"all {messages} messages on {len(topics)} topics" in printed[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened):
     change = "servo_of.joint02.stall_torque=0.1"
     path = again(room, tmp_path / "weak.mcap", "--set", change, "--json")
@@ -94,7 +94,7 @@ def commands(room):
     return room
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_path, capsys):
     plain = again(commands, tmp_path / "plain.mcap", source="plain.mcap")
     printed = capsys.readouterr().out

@@ -131,7 +131,7 @@ def problems(path, healthy, truth):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("faults", RUNS, ids="; ".join)
 def test_faults_on_the_bus_are_named(tmp_path, scenario, healthy_on_the_bus, faults):
     """By every output."""
@@ -149,7 +149,7 @@ def test_faults_on_the_bus_are_named(tmp_path, scenario, healthy_on_the_bus, fau
     assert not wrong, wrong
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("torque", "truth"),
     [

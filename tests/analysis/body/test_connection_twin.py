@@ -16,7 +16,7 @@ from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, load_scenario, run_batch
 from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 SETTLE, MEASURED = 6, 6
 """Cycles."""

@@ -71,7 +71,7 @@ def test_a_robot_gives_planes_and_metres():
     assert {one.plane for one in motion.waves} == {one.plane for one in motion.joints}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @settings(max_examples=40, deadline=None)
 @given(
     st.floats(-3.0, 3.0),
@@ -92,7 +92,7 @@ def test_order_and_time_turn_a_wave_round(step, sizes, phase):
     assert reverse.travelling_index.value == index
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_standing_wave_has_no_direction_and_an_interval_to_zero():
     random = np.random.default_rng(1)
     to_zero = 0
@@ -125,7 +125,7 @@ def test_a_constant_joint_keeps_its_place_in_the_chain():
 
 
 @pytest.mark.parametrize(
-    "seconds", [8.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (20.0, 60.0))]
+    "seconds", [8.0, *(pytest.param(s, marks=pytest.mark.nightly) for s in (20.0, 60.0))]
 )
 def test_intervals_hold_the_truth_and_are_no_wider_than_the_bound(seconds):
     """95 % of 200 draws within binomial scatter (91 to 98 %), width over the Cramer-Rao bound's."""

@@ -69,7 +69,7 @@ def test_means_are_those_of_straight_lines_between_samples():
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", contact_tables.LIFTING)
 def test_contact_in_the_twin_is_right_as_often_as_stated(name):
     """Of runs that the scales were not chosen by."""
@@ -79,7 +79,7 @@ def test_contact_in_the_twin_is_right_as_often_as_stated(name):
     assert current > low - 0.06
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_session_of_the_twin_states_its_contact_and_how_often_that_is_right(tmp_path, command):
     path = tmp_path / "s.mcap"
     command("sim", "run", "snake13-vertical-pi2", "--duration", "16", "-o", path)
@@ -94,7 +94,7 @@ def test_a_session_of_the_twin_states_its_contact_and_how_often_that_is_right(tm
     assert "chance: 50 %" in " ".join(command("analyse", path).out.split())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_efforts_of_another_sign_or_unit_give_no_contact(tmp_path, command):
     random = np.random.default_rng(4)
     (run,) = run_batch([contact_tables.varied("snake13-vertical-pi2", random)[0]])

@@ -96,7 +96,7 @@ def test_a_worn_joint_is_named_with_its_date(without_models):
     assert begun.date().isoformat() in fleet.answer
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_variance_components_are_those_planted():
     sessions, rows, _, _ = frames(8)
     (robot,) = analyse_fleet(sessions, rows).robots
@@ -180,7 +180,7 @@ def test_one_joint_does_not_move_the_others():
     assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_wear_hardly_a_joint_is_named(without_models):
     named = 0
     for seed in range(50):
@@ -189,7 +189,7 @@ def test_without_wear_hardly_a_joint_is_named(without_models):
     assert named <= 2  # binomial, 1 %: 2 or fewer in 99 %
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["step", "ramp", "saturating"])
 def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
     good = 0

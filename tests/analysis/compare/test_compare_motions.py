@@ -67,13 +67,13 @@ STANDING = 0.4 * np.cos(0.5 * np.arange(6) + 0.2) + 0j
 CIRCLE = 0.4 * np.exp(-1j * np.pi / 3 * np.arange(6))  # both semi-axes as long
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_false_alarms_are_at_most_one_in_twenty():
     """3 of 60: more than 7 would be beyond binomial scatter of 5 %."""
     assert false_alarms(WAVE, 60) * 60 <= 7
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("amplitudes", [WAVE, WEAK, INVERTED, STANDING, CIRCLE])
 def test_false_alarms_of_any_motion(amplitudes):
     assert false_alarms(amplitudes, 150) <= 0.05 + 3 * (0.05 * 0.95 / 150) ** 0.5

@@ -9,7 +9,7 @@ from undulog.capture import Session
 from undulog.sim import load_scenario, record
 from undulog.sim.scenario.scenario import Kernels
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}

@@ -46,7 +46,7 @@ def test_it_changes_the_fundamental_as_its_describing_function_has_it(share):
     assert got == pytest.approx(complex(real, -(1 - x * x) / math.pi), abs=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["play", "play behind a lag", "stick"])
 @pytest.mark.parametrize("steps", [5, 20])
 def test_its_width_is_found_within_a_tenth_and_the_interval_covers(kind, steps):
@@ -62,7 +62,7 @@ def test_its_width_is_found_within_a_tenth_and_the_interval_covers(kind, steps):
     assert np.mean(no_step) >= 0.91
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("how", [{"frequency": 0.25}, {"noise": 4e-4}, {"rate": 100.0}])
 @pytest.mark.parametrize("kind", ["play", "play behind a lag", "stick"])
 def test_also_in_step_with_the_gait_in_noise_and_sampled_fast(kind, how):
@@ -78,7 +78,7 @@ def test_also_in_step_with_the_gait_in_noise_and_sampled_fast(kind, how):
     assert np.mean(covers) >= 0.91
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_joint_that_breaks_away_catches_up_by_its_step():
     made, found, _ = measured("stick", 30, excess=15 * STEP, lag_s=0.02)
     assert len(found) == JOINTS
@@ -88,7 +88,7 @@ def test_a_joint_that_breaks_away_catches_up_by_its_step():
             assert end.step_rad == pytest.approx(made[k].gain * 15 * STEP, rel=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_it_does_to_gain_and_lag_is_its_share_of_them():
     made, found, gait = measured("play", 25)
     for k, one in found.items():

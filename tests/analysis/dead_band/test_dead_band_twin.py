@@ -55,7 +55,7 @@ def two_joints(width, stall_torque):
     return [Logged(t_s, commands[:, j], seen[:, j]) for j in range(2)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("stall_torque", [1.5, 0.25])
 @pytest.mark.parametrize("steps", [6, 20])
 def test_its_width_is_found_within_a_tenth_and_covered(steps, stall_torque):

@@ -19,7 +19,7 @@ def judged(*case, **more):
 
 
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])
-@pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9])
+@pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.nightly), 0.9])
 def test_contrasts_cover_whatever_joints_share(shared, correlation):
     """300 runs of nine joints: the standard error of one contrast's coverage is 1.3 %."""
     covered = judged(shared, correlation)
@@ -27,7 +27,7 @@ def test_contrasts_cover_whatever_joints_share(shared, correlation):
     assert 0.925 < covered[:, JOINTS:].mean() < 0.975  # four contrasts: 0.6 %
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_joints_at_different_rates_and_short_records():
     for covered in judged("additive", 0.9, every=(1, 2, 3)):
         assert 0.93 < covered[:JOINTS].mean() < 0.97
@@ -36,7 +36,7 @@ def test_joints_at_different_rates_and_short_records():
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
 def test_coverage_of_contrasts(shared, correlation):

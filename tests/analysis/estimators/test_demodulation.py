@@ -75,7 +75,7 @@ def test_responses_on_their_own_times():
     np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("memory", [0.0, 0.9])
 def test_intervals_cover_in_white_and_coloured_noise(memory):
     """3,480 gains and lags, noise of 0.01 rad, white and AR(1), omega and amplitude changing."""

@@ -82,7 +82,7 @@ class Trials:
         return np.sqrt(np.mean(np.square(self.lag))) / self.bound
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lag_gain_and_intervals_with_exact_commands():
     trials = Trials(seed=11)
     # 2,000 lags: the ratio's own standard error is 1.6 %, the coverage's 0.5 %.
@@ -97,7 +97,7 @@ def test_lag_gain_and_intervals_with_exact_commands():
     assert all(trials.omega_inside)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_noisy_channels_and_the_shared_frequency():
     trials = Trials(seed=12, noisy_command=True)
     assert 0.95 < trials.ratio() < 1.05
@@ -107,7 +107,7 @@ def test_two_noisy_channels_and_the_shared_frequency():
     assert np.mean(trials.omega_inside) > 0.88
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("noisy_command", [False, True])
 def test_intervals_hold_in_coloured_noise(noisy_command):
     trials = Trials(seed=13, correlation=0.9, noisy_command=noisy_command)
@@ -119,7 +119,7 @@ def test_intervals_hold_in_coloured_noise(noisy_command):
     assert noisy_command is False or np.mean(trials.omega_inside) > 0.88
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
 @pytest.mark.parametrize(
     ("frequency", "duration"), [(1.0, 3.1), (0.97, 4.2), (0.5, 8.0), (0.5, 8.9), (0.5, 30.0)]

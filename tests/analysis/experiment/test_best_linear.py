@@ -52,7 +52,7 @@ def periods(values, noise, rng, count=2):
     return repeated + noise * rng.normal(size=repeated.shape)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("square", "cube"), [(0.0, 0.15), (0.2, 0.0), (0.15, 0.1)])
 def test_distortion_is_that_of_a_thousand_noise_free_realisations(square, cube):
     rng = np.random.default_rng(2)

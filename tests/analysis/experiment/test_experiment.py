@@ -76,7 +76,7 @@ def weak(tmp_path_factory):
     return write_ways(tmp_path_factory.mktemp("weak"), module=module)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_identical_modules_with_a_boundary_pattern(alike):
     result = experiment(alike)
     reversal = result.reversal
@@ -117,7 +117,7 @@ def test_a_weak_module_is_named(weak):
     assert by_name["joint13"].mirror == "joint13"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
     end = "; boundary or module is open: one direction only; record the reverse"
@@ -137,7 +137,7 @@ def test_one_direction_is_not_separable(alike):
     assert "6 independent runs with the wave from head to tail and 0 from tail to head" in warning
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
     kick = (3, np.exp(0.05j))
     odd = {
@@ -160,7 +160,7 @@ def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
     assert "a copy is not a run of its own" in result.runs[-1].why
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_that_are_too_few_or_not_in_turn(alike):
     result = experiment(alike[:6])
     few = "p can't go below 0.1 with 3 + 3 runs, so no difference"
@@ -200,7 +200,7 @@ def test_nothing_that_travels(tmp_path):
     assert render_experiment(result).startswith("2 sessions: no gait with a travelling wave")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_json_object(weak, tmp_path, report_of):
     out = tmp_path / "experiment.json"
     words = ["analyse", *map(str, weak), "--start", "0.02"]
@@ -220,7 +220,7 @@ def test_the_json_object(weak, tmp_path, report_of):
         assert {"value", "ci95", "p", "unit", "label"} == set(index)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_first_line_is_the_answer(weak, alike, command):
     lines = command("analyse", *weak).out.splitlines()
     assert lines[0].startswith(

@@ -9,7 +9,7 @@ from support.analysed import experiment
 from undulog.sim import load_scenario, record
 from undulog.sim.scenario.scenario import Kernels
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 ROBOT = twin_chains.chain(7, stall_torque=0.25)

@@ -129,7 +129,7 @@ def test_roles_warnings_and_text(result, sessions):
         assert re.search(line, text, re.MULTILINE), line
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_json_object(sessions, report_of):
     coupling = report_of("analyse", *sessions)["coupling"]
     assert coupling["identifiable"] is True
@@ -139,14 +139,14 @@ def test_the_json_object(sessions, report_of):
         assert np.shape(coupling[name][field]) == (M, M)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_order_of_the_files_does_not_matter(result, sessions):
     again = experiment(sessions[::-1]).coupling
     np.testing.assert_allclose(again.P.value, result.coupling.P.value, atol=1e-9)
     assert again.checks_pass
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_phase_kicks_alone_give_p_and_r(sessions):
     result = experiment(sessions[: 1 + 2 * M])
     coupling = result.coupling

@@ -110,7 +110,7 @@ def test_when_each_run_started_does_not_matter():
     np.testing.assert_allclose(shifted, still, rtol=0.0, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_cover_what_was_planted():
     """Noise of known variance, each error estimated with 8 degrees of freedom as a fit gives it."""
     H, command = planted(m=3)

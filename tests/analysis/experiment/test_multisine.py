@@ -75,7 +75,7 @@ def exact_response(found):
     return signal.freqz(*FILTER, worN=hz, fs=RATE_HZ)[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command):
     files = drive(planned("--realisations", 4), tmp_path)
     result = report_of("analyse", *files)
@@ -99,7 +99,7 @@ def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command)
     assert "Dashed: standard deviation" in page.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("order", ["odd", "even"])
 def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
     bent = {"cube": 2.5} if order == "odd" else {"square": 1.0}
@@ -115,7 +115,7 @@ def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
         assert one["distortion"]["value"] < 0.01  # a square makes no odd lines of odd lines
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_path, report_of):
     files = drive(planned("--realisations", 3, "--runs", 2), tmp_path, cube=2.5, record={})
     best = report_of("analyse", *files, "--start", 4)["best_linear"]
@@ -123,7 +123,7 @@ def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_p
     assert best["joints"][0]["distortion"]["value"] > 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_orthogonal_commands_give_the_response_to_each_other_joint(planned, tmp_path, report_of):
     mix = np.array([[1.0, 0.3], [-0.2, 0.8]])
     files = drive(planned("--realisations", 2, "--inputs", "orthogonal"), tmp_path, mix=mix)
@@ -154,7 +154,7 @@ def test_one_period_or_realisation_separates_nothing(words, what, planned, tmp_p
     assert any(warning.startswith(what) for warning in result["warnings"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_copy_and_a_wrong_record_are_named(planned, tmp_path, report_of, command):
     plans = planned("--realisations", 2)
     files = drive(plans, tmp_path)

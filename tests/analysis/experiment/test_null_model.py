@@ -82,7 +82,7 @@ def test_it_is_generalised_least_squares():
     assert found.gain[2] == pytest.approx(free.fun - other.fun, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("curvature", "dof"), [(0.0, 6), (0.4, 24)])
 def test_a_shift_of_the_shared_parameters_is_absorbed(curvature, dof):
     """Identical modules, theta drawn from the prior: 5 % false alarms, family-wise."""
@@ -101,7 +101,7 @@ def test_a_shift_of_the_shared_parameters_is_absorbed(curvature, dof):
 
 
 @pytest.mark.parametrize(
-    "module", [0, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 6))]
+    "module", [0, 3, *(pytest.param(k, marks=pytest.mark.nightly) for k in (2, 6))]
 )
 def test_a_weak_module_is_found_and_named(module):
     """Also the middle one, to which a reversal is blind."""

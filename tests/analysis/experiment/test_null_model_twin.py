@@ -22,7 +22,7 @@ def wave(lag, stall, **tables):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_from_the_twin_to_a_named_module(tmp_path, capsys, command):
     """The middle joint, to which a reversal is blind, from one direction alone."""
     (tmp_path / "chain.toml").write_text(twin_chains.chain(9))

@@ -122,7 +122,7 @@ def test_it_is_blind_to_mirror_symmetric_modules_and_to_the_middle_one():
     assert np.abs(mirror_test(forward, reverse).difference).max() < 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("noise", [{}, {"ar": 0.9}], ids=["white", "AR"])
 def test_identical_modules_are_called_different_in_one_experiment_of_twenty(noise):
     """5,000 experiments, a boundary pattern, noise on the encoders' samples: 5 % +- 1."""

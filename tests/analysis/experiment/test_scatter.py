@@ -29,8 +29,8 @@ def coupled(experiment):
 @pytest.mark.parametrize(
     ("scatter_deg", "how", "base_runs"),
     [(0.0, "each", 6), (0.1, "each", 1), (0.1, "each", 6), (0.1, "common", 6)]
-    + [pytest.param(0.1, how, 6, marks=pytest.mark.slow) for how in ("odd", "drift")]
-    + [pytest.param(sd, "each", 6, marks=pytest.mark.slow) for sd in (0.03, 0.3)],
+    + [pytest.param(0.1, how, 6, marks=pytest.mark.nightly) for how in ("odd", "drift")]
+    + [pytest.param(sd, "each", 6, marks=pytest.mark.nightly) for sd in (0.03, 0.3)],
 )
 def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs):
     random, options = np.random.default_rng(3), {"how": how, "base_runs": base_runs}
@@ -44,13 +44,13 @@ def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs
     assert found["half"] <= 1.5 * 1.96 * math.sqrt(2) * sigma / (2 * kick_tables.KICK)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_coupling_the_headline_shows_none():
     found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
     assert found["headline"] <= 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_nonlinearity_is_still_found():
     """A servo whose gain falls with amplitude, 14 % nonlinear, under scatter of 0.03 degrees."""
     random = np.random.default_rng(5)

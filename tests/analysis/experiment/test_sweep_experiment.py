@@ -207,7 +207,7 @@ def test_responses_that_drift_are_reported(tmp_path):
     assert result.coupling.contact is False
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_multisine_shows_every_tone(tmp_path):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = f"physics_rate_hz = 1000000000\n[servo]\ncoulomb_friction = 0.0\n{FREE}"
@@ -225,7 +225,7 @@ def test_a_multisine_shows_every_tone(tmp_path):
     assert [run.role for run in result.runs] == ["sweep"] * M
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_multisine_in_contact_reports_what_is_mixed(tmp_path, opened):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = 'physics_rate_hz = 1000\n[world]\nsurface = "flat"\n'

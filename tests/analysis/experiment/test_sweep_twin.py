@@ -120,7 +120,7 @@ def check(coupling, robot, *, h, z, seconds):
         assert tone["condition_number"] == pytest.approx(np.linalg.cond(H), rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_short_chain(tmp_path):
     """Five joints, three of them yaw joints, at 2 Hz."""
     robot = world(tmp_path, 5, 2.0)
@@ -136,7 +136,7 @@ def long_chain(tmp_path_factory):
     return world(folder, 13, 0.5), measured(folder, "lag-sweep"), measured(folder, "multisine")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.built("tables")
 def test_13_joints(long_chain):
     robot, lag_sweep, multisine = long_chain
@@ -144,7 +144,7 @@ def test_13_joints(long_chain):
     check(multisine, robot, h=5e-3, z=0.02, seconds=20)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.built("tables")
 def test_both_plans_agree(long_chain):
     """At the frequency that they share they differ by the encoders' noise.
@@ -163,7 +163,7 @@ def test_both_plans_agree(long_chain):
     assert chi2.sf(np.sum(scores**2), scores.size) > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.built("tables")
 def test_the_chain_is_reciprocal_and_reaches_far(long_chain):
     """Equal and opposite: Z is symmetric; and nearest neighbours hold the lesser part of it."""

@@ -93,7 +93,7 @@ def test_levels_of_a_normal_matrix_are_distances():
     assert 2.0e-3 < found.noise < 6.0e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_of_rates_hold_the_truth():
     rng = np.random.default_rng(7)
     P = signed(rng, 6)

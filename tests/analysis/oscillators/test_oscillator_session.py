@@ -49,7 +49,7 @@ def planted(link):
     return FORWARD[j] if j < i else BACKWARD[i]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("feedback", [0.0, 0.6])
 def test_a_kicked_session_gives_its_couplings(tmp_path, feedback, command, report_of):
     path = write(tmp_path / "run.mcap", 29.0, kick_every_s=3.0, kick_size=1.0, feedback=feedback)

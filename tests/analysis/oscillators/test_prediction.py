@@ -96,7 +96,7 @@ def rates_of(H, c):
     return EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
 
 
-@pytest.mark.parametrize("draws", [8, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [8, pytest.param(20, marks=pytest.mark.nightly)])
 def test_intervals_of_rates_hold_under_scatter(draws):
     J = rates_of(*kick_tables.chain(5)) / EPS
     truth = EPS * np.sort(np.linalg.eigvals(of_deviations(np.eye(5) + J)).real)
@@ -109,7 +109,7 @@ def test_intervals_of_rates_hold_under_scatter(draws):
     assert np.mean(inside) >= 0.91
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_is_left_of_a_kick_has_an_interval():
     J = rates_of(*kick_tables.chain(5))
     off = 0.1 * (np.arange(5) == 2)
@@ -157,7 +157,7 @@ def result(tmp_path_factory):
     return folder / "kicks.json", files
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, report_of):
     file, sessions = result
     found, direct = (report_of("predict", *one, "--eps", "0.3")["J"] for one in ([file], sessions))

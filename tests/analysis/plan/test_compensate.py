@@ -171,7 +171,7 @@ def test_what_does_not_fit_is_refused():
         compensation(EXACT, BASE, None, target_gain=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_by_the_commands_of_the_manual(tmp_path, command, report_of):
     """Kicks, analysis, compensation, its recording, and again with --after."""
     paths = linear_chain.kicked(tmp_path)

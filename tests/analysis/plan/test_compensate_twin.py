@@ -8,7 +8,7 @@ import pytest
 
 from support.compensating import Stage, Wave, indices, ratio
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 M = 13
 

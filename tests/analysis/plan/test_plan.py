@@ -43,7 +43,7 @@ def like(tmp_path_factory):
     return write_gait(tmp_path_factory.mktemp("like") / "like.mcap")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_kicks_read_back_as_kicks(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
     files = report_of("plan", "phase-kicks", *words)["files"]

@@ -149,7 +149,7 @@ def test_intervals_contain_what_a_gait_settles_at(case):
         assert found.trends[expected] >= 23, found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("case", "cycles"), list(zip(CASES, itertools.cycle([24, 40]), strict=False))
 )
@@ -163,7 +163,7 @@ def test_intervals_hold_in_19_of_20_repetitions(case, cycles):
         assert found.trends[Trend.STEADY] >= 0.95 * REPETITIONS, found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_variation_of_one_joint():
     """One joint shows its correlation poorly: the interval holds, but is wider."""
     found = outcome(CASES["variation"][0], 24, REPETITIONS, seed=7, joints=1)
@@ -171,7 +171,7 @@ def test_variation_of_one_joint():
     assert 0.91 <= found.lag <= 0.98, found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("joints", [1, 8])
 @pytest.mark.parametrize("case", ["none", "settling", "drift"])
 def test_short_sessions_hold(case, joints):
@@ -243,7 +243,7 @@ def test_a_ringing_body_mode_is_told_from_the_gait():
     assert sum(low <= 0.2 <= high for low, high in lags) >= 7
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_variation_that_joints_share_counts_once():
     rng = np.random.default_rng(9)
     inside = []

@@ -12,7 +12,7 @@ LEFT = 1e-4
 """What may be left of the transient in the long run, and of friction's own scatter, in ln H."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["weak-servo-pi3", "flat"])
 def test_a_short_session_gives_what_a_long_one_settles_at(name, tmp_path):
     pytest.importorskip("pybullet")

@@ -20,7 +20,7 @@ def servo(f_hz, delay_s, natural_hz=3.0, damping=0.4):
     return np.exp(-s * delay_s) * w**2 / (s**2 + 2 * damping * w * s + w**2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_delay_and_response_of_a_second_order_system_lie_within_their_intervals():
     rng, inside = np.random.default_rng(0), []
     for _ in range(60):

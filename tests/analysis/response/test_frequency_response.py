@@ -91,7 +91,7 @@ def columns(path, key):
     return times, np.array([json.loads(row[key]) for row in rows])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_recordings
 def test_the_halves_of_an_arms_multisine_agree(tmp_path):
     folder = SHARED / "so101/multisine"
@@ -208,7 +208,7 @@ def test_each_bin_of_a_quadrupeds_chirp_is_predicted_by_the_others():
     assert (np.abs(np.mean(apart, axis=0) - white) < 3 * scatter).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_recordings
 def test_a_quadrupeds_chirp_is_one_input(tmp_path):
     with zipfile.ZipFile(SHARED / "go2/traj_0.pt") as archive:

@@ -21,7 +21,7 @@ Snake, GOLDEN = group_tables.Snake, group_tables.GOLDEN
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("ratio", "bend"), [(1.0, 0.0), (1.5, 0.0), (GOLDEN, 0.02)])
 def test_lags_at_the_bound_and_intervals_that_hold_in_each_group(ratio, bend):
     """Truth: the same estimator on the noise-free run; 40 draws of 16 joints here."""
@@ -142,7 +142,7 @@ def test_lines_of_the_other_groups_are_distinct():
     assert further_lines([3.0, 2.0, 2.96], 1, 1, 100.0, 60.0)[:2] == (3.0, 6.0)  # 0.04: 0.4 / T
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mixed_tones_are_modelled_where_they_stand_out_and_only_there():
     """At 2 f2 - f1 and 3 f1 - 3 f2, three and ten times an amplitude's noise, in all joints."""
     rng = np.random.default_rng(6)
@@ -226,7 +226,7 @@ def test_too_slow_or_too_few_samples_for_a_group_are_reported():
     assert any("too few response samples" in text for text in notes)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_shared_frequencies_have_intervals_that_hold():
     """Commands and responses with noise of 5 mrad; 40 draws of two frequencies."""
     snake = Snake(GOLDEN, joints=6)

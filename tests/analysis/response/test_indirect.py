@@ -69,7 +69,7 @@ def test_the_direct_estimate_is_biased_as_derived_and_the_indirect_one_is_not():
     assert 0.91 <= covers <= 0.98, covers
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_tones_of_a_reference():
     rng = np.random.default_rng(5)
     tones = np.array([0.31, 0.73, 1.9, 4.1])

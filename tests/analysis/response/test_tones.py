@@ -31,7 +31,7 @@ def tones_of(command):
     return find_tones(command, resampled(command, t_s))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_hold_the_chosen_responses():
     rng, inside = np.random.default_rng(0), []
     for _ in range(100):

@@ -48,7 +48,7 @@ def test_the_critical_value_of_contrasts_is_the_quantile_of_the_largest(
     assert found == pytest.approx(expected, abs=within)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("shared", [0.0, 0.8])
 def test_identical_joints_rarely_differ(shared):
     rng = np.random.default_rng(3)

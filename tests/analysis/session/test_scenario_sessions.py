@@ -50,7 +50,7 @@ def test_all_shipped_scenarios_are_here():
     assert {*STEADY, *ADAPTIVE, *AMONG_OBSTACLES} == set(scenario_names())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "engine", "kernels"),
     [
@@ -81,7 +81,7 @@ def sensor_flags(result):
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", STEADY)
 def test_a_steady_scenario_closes_its_balance_and_has_sound_sensors(name, tmp_path):
     result = analysed(name, tmp_path, STEADY_S)
@@ -97,7 +97,7 @@ def test_a_steady_scenario_closes_its_balance_and_has_sound_sensors(name, tmp_pa
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", AMONG_OBSTACLES)
 def test_contact_makes_no_speed_that_a_sensor_is_blamed_for(name, tmp_path):
     result = analysed(name, tmp_path)
@@ -107,7 +107,7 @@ def test_contact_makes_no_speed_that_a_sensor_is_blamed_for(name, tmp_path):
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ADAPTIVE)
 def test_an_adaptive_scenario_gives_sense_over_time(name, tmp_path):
     result = analysed(name, tmp_path)

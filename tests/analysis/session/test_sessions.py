@@ -36,7 +36,7 @@ def inside(estimates, truth):
     return [e.ci95[0] <= value <= e.ci95[1] for e, value in zip(estimates, truth, strict=True)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
     """f = 0.97 Hz, 7.3 s at 100 Hz, A 0.3 to 0.5 rad, sigma = 0.01 rad, polling skew 5 ms."""
     rng = np.random.default_rng(2024)
@@ -60,7 +60,7 @@ def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
     assert abs(np.degrees(np.polyfit(truth.skew_s, np.mean(error, axis=0), 1)[0] * 5e-3)) < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_polling_skew_biases_the_lag_only_where_it_is_not_logged(bag, wave):
     truth = wave(np.random.default_rng(3))
     still = np.zeros((truth.ticks_ns.size, 25))

@@ -38,7 +38,7 @@ def test_torque_cut_at_the_stall_torque_is_a_limit(seed, tmp_path):
     assert not np.any(beyond & ~flagged)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
     """duty = Kp (command - angle), at most 1; nothing else is wrong with the session."""
     (tmp_path / "chain.toml").write_text(twin_chains.chain(5))

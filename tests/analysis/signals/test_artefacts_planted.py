@@ -71,7 +71,7 @@ PLANTED = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
 def test_a_planted_artefact_is_found_when_it_was_and_nothing_else(plant, tmp_path):
     flag, quantity, brought, least, shortest = PLANTED[plant]
@@ -103,7 +103,7 @@ def test_a_planted_artefact_is_found_when_it_was_and_nothing_else(plant, tmp_pat
     assert min(met) >= least, met
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sound_sessions_have_no_artefact(tmp_path):
     found = {seed: artefacts(Snake(seed).write(tmp_path / f"{seed}.mcap")) for seed in SEEDS}
     assert {seed: ones for seed, ones in found.items() if ones} == {}

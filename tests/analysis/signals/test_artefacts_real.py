@@ -35,7 +35,7 @@ def session_of(name, path):
     return write_topics(path, EPOCH_NS + np.rint(raw["time"] * 1e9).astype(np.int64), topics)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "period"), RUNS)
 def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path, opened):
     path = session_of(name, tmp_path / "joint7.mcap")
@@ -94,7 +94,7 @@ def arm(tmp_path_factory):
         return analyse_session(session)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
     assert all(joint.gain.value is not None for joint in arm.joints)
     wrong = {(one.joint, one.quantity, one.flag) for one in arm.artefacts if one.about == "sensor"}

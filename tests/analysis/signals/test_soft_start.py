@@ -99,7 +99,7 @@ def test_groups_that_start_apart():
     assert stop == pytest.approx(19.98)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_soft_start_in_a_bag_leaves_the_interval_of_a_steady_one(bag, wave):
     """5 s of growth; the response follows at once, so the truth is that of the steady gait."""
     widths = []

@@ -83,7 +83,7 @@ def test_a_vibration_near_the_limit_of_the_sampling_is_no_noise(chain):
     assert "noisy_sensor" not in {kind for one in chain.judged().values() for kind in one.kinds}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_noisy_coarse_encoder_repeats_values_by_chance():
     for seed in range(20):
         assert coarse(seed).judged() == {}

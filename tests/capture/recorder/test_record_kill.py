@@ -113,7 +113,6 @@ def test_a_killed_recording_has_what_was_accepted(options, tmp_path, command, cy
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.clock(0.02, "a recorder that is killed has what was accepted 50 ms before")
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
 def test_fifty_kills(options, tmp_path, command, cycle):

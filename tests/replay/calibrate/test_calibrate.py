@@ -50,7 +50,7 @@ def small(tmp_path_factory):
 TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
     report, found = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
@@ -68,7 +68,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_dead_time_is_reported_and_not_written(small, tmp_path, report_of):
     late_s = 0.012
     late_ns = round(late_s * 1e9)
@@ -119,7 +119,7 @@ def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_weak_module_is_found_among_hidden_parameters(tmp_path, report_of):
     hidden = """[servo]
 stall_torque = 0.345
@@ -152,7 +152,7 @@ mu_normal = 0.42
     assert again.world.ground.mu_normal == found["mu_normal", None]["value"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, report_of):
     """What the slow wave above leaves open, as it says itself."""
     hidden = "[servo]\nstall_torque = 0.345\nproportional_gain = 6.8\nviscous_friction = 0.006\n"
@@ -166,7 +166,7 @@ def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, report_of):
     assert not any("stall torque" in one["factors"] for one in report["ridges"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_with_the_rest_known_servo_and_ground_are_within_three_percent(tmp_path, report_of):
     hidden = """[servo]
 stall_torque = 0.27
@@ -188,7 +188,7 @@ mu_normal = 0.56
     assert found["proportional_gain", None]["determined"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, report_of, command):
     """A motor at constant speed, in the air: one lag for six parameters."""
     if not TRACE.is_file():
@@ -225,7 +225,7 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("n", "rho"), [(300, 0.0), (300, 0.8), (1000, 0.9)])
 def test_intervals_of_a_linear_model_cover(n, rho):
     """Three joints, four parameters whose columns are two harmonics of three or ten cycles."""

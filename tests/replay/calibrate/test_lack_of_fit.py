@@ -35,7 +35,7 @@ def of_kind(random, kind):
     return colored(random, kind, T.size)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", [0.0, 0.9, 0.99, "mixed"])
 def test_the_level_holds_under_noise_with_a_memory(kind):
     random = np.random.default_rng(1)
@@ -56,7 +56,7 @@ def test_it_finds_what_comes_back_every_cycle():
         assert size == pytest.approx(loud * 0.7 * SIGMA / math.sqrt(2), rel=0.25)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_samples_at_their_own_times_and_a_drift():
     random = np.random.default_rng(3)
     t = np.sort(random.uniform(0, 6.5, 600))
@@ -159,7 +159,7 @@ def fitted(folder, report_of, only, *, source="run.mcap", more=()):
     return report, {name: one for (name, _), one in found.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_friction_law_excludes_no_truth(tmp_path, report_of):
     """The robot slips by Transeth's law, the model by the ellipse; the servo is 5 % off."""
     hidden = '[servo]\nstall_torque = 0.315\n[world.ground]\nlaw = "transeth"\n'
@@ -175,7 +175,7 @@ def test_another_friction_law_excludes_no_truth(tmp_path, report_of):
     assert 0.0 < low < 1.0 < high
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_path, command):
     twin_fits.room_for(tmp_path, 4, 6.0, '[world.ground]\nlaw = "transeth"\n', noise=0.001)
     words = [word for name in ONLY for word in ("--only", name)]
@@ -186,7 +186,7 @@ def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_p
     assert "The twin does not fit that session" in (tmp_path / "f.toml").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hidden_play_is_the_first_line(tmp_path, report_of):
     """Play of 0.02 rad behind one joint's encoder, as a worn gear has it."""
     twin_fits.room_for(tmp_path, 3, 6.0, "", noise=0.002)
@@ -214,7 +214,7 @@ def with_play(source, target, width):
     twin_fits.rewritten(source, target, change)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_right_law_is_left_alone(tmp_path, report_of):
     twin_fits.room_for(tmp_path, 4, 6.0, "[servo]\nstall_torque = 0.33\n")
     report, found = fitted(tmp_path, report_of, ONLY)

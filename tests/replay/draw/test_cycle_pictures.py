@@ -12,7 +12,7 @@ from undulog.replay.layout import build_blueprint
 from undulog.replay.numbers import computed
 from undulog.replay.recording import write_recording
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 @pytest.fixture(scope="module")

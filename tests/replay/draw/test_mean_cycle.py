@@ -97,7 +97,7 @@ def test_a_gait_that_changes_is_averaged_and_says_so(
     assert "0.0 to 3.0 s" in words  # all of the logged phase
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_twins_settled_motion_is_its_mean_cycle(twin):
     file, written, recorded = twin
     (series,) = written.content.mean.measured

@@ -78,6 +78,6 @@ def test_only_links_without_a_mesh_are_capsules(file, read_back):
     assert {len(row) for row in drawn} == {1}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_viewer_draws_the_boxes(file, show):
     assert show(file, 0.09).complaints() == []

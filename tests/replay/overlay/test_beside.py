@@ -155,7 +155,7 @@ def beside(files, read_back, tmp_path_factory):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_session_keeps_its_entities_under_its_own_name(
     files, beside, read_back, tmp_path, command
 ):
@@ -223,7 +223,7 @@ def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     np.testing.assert_allclose(apart, expected, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path, report_of):
     path = tmp_path / "w.rrd"
     report = report_of("view", *files, "--place", "world", "--save", path)
@@ -248,7 +248,7 @@ def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(besid
 BAR_VALUES = "BarChart:values"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid, opened):
     slow = Wave(amplitude=0.36, delay=0.2)
     files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
@@ -305,7 +305,7 @@ def test_a_phase_is_found_where_it_was_first_reached():
     np.testing.assert_allclose(found[known] * 1e-9, np.array(expected)[known], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, report_of):
     bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
     for pair in ((files[0], bare), (bare, files[0])):
@@ -329,7 +329,7 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, o
     assert "/compared/a/angles" not in found.entities
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path, overlaid):
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
@@ -341,7 +341,7 @@ def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path
     assert "/compared/other/angles" not in found.entities
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_sessions_are_each_held_against_the_first(files, still, overlaid):
     out, found = overlaid(*files, still, "--names", "robot,twin,no gait")
     assert [line.split(" (B)")[0] for line in out.splitlines()[:2]] == ["twin", "no gait"]
@@ -367,7 +367,7 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
@@ -398,7 +398,7 @@ def test_wrong_usage_is_explained(files, tmp_path, command, words, complaint):
     assert "--align: needs two sessions or more" in command(*alone, code=2).err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_files_of_one_name_are_kept_apart(files, tmp_path, report_of):
     report = report_of("view", files[0], files[0], "--save", tmp_path / "x.rrd")
     assert [one["name"] for one in report["sessions"]] == ["a 1", "a 2"]
@@ -419,7 +419,7 @@ def converted(files, tmp_path_factory):
         ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     path = tmp_path / "x.rrd"
     path.write_bytes(b"mine")
@@ -478,7 +478,7 @@ def in_a_grid(*shown):
     return rrb.Blueprint(grid, panel, collapse_panels=True)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_path, monkeypatch):
     monkeypatch.setattr("undulog.replay.overlay.write.build_blueprint", in_a_grid)
     write_overlay(converted, tmp_path / "all.rrd", Align.TIME)
@@ -490,7 +490,7 @@ def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_pa
         assert marked(rgb(grid.picture(name))) > 150, f"the view {name!r} is empty"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_both_bodies_and_both_kinds_of_line_are_drawn(window, rgb):
     assert window.complaints() == []
     bodies = rgb(window.picture("robot solid, twin as wireframe"))

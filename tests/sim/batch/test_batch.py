@@ -75,7 +75,7 @@ def short(scenario, joints):
     return dataclasses.replace(scenario, robot=robot)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_angles_are_those_of_the_twin_on_mujoco_under_every_law(weak):
     scenarios = [
         with_law(short(weak, joints), law) for law in LAWS for joints in (5, len(weak.robot.joints))
@@ -87,7 +87,7 @@ def test_angles_are_those_of_the_twin_on_mujoco_under_every_law(weak):
         np.testing.assert_allclose(run.angle, expected, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_gain_and_lag_over_5_s_are_those_of_the_twin_on_mujoco(weak):
     scenario = weak.changed(duration_s=5.0)
     (run,) = run_batch([scenario])
@@ -97,7 +97,7 @@ def test_gain_and_lag_over_5_s_are_those_of_the_twin_on_mujoco(weak):
     np.testing.assert_allclose(found, expected, atol=1e-11)  # the bar is 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_single_precision_keeps_gain_and_lag_within_a_thousandth(weak):
     scenario = weak.changed(duration_s=5.0)
     yaw = scenario.robot.joint_indices(Plane.HORIZONTAL)
@@ -137,7 +137,7 @@ def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
         assert getattr(run, name)[: len(expected)] == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_open_loop_scenario_without_a_lateral_instability_is_the_twins():
     # Those in the vertical plane alone are unstable sideways: rounding decides when they leave it.
     names = [
@@ -300,7 +300,7 @@ np.savez(sys.argv[2], *[part for one in done for part in (one.angle, one.work, o
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("law", [FrictionLaw.ELLIPSE, None])
 def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
     """By numba's simulator of a GPU, which runs the kernel and its copies thread by thread.

@@ -47,7 +47,7 @@ modulations = st.builds(Modulation, seven, seven, st.floats(-10.0, 10.0))
 some_limits = st.tuples(*[st.tuples(st.floats(-3.0, 0.0), st.floats(0.0, 3.0))] * 7)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", GAITS)
 @given(some_limits, st.lists(modulations, min_size=1, max_size=8), st.integers(0, 9))
 @settings(max_examples=40, deadline=None)

@@ -62,7 +62,7 @@ def commands(name):
     return np.array([gait.step(k / 100, nothing).command for k in range(scenario.tick_count)])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "speed"), [("caterpillar", 0.039), ("caterpillar-pi2", 0.023)])
 def test_a_caterpillar_creeps_straight_ahead(name, speed):
     found = motion(name)
@@ -70,7 +70,7 @@ def test_a_caterpillar_creeps_straight_ahead(name, speed):
     assert abs(found.left) < 1e-3 * found.speed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sidewinder_walks_sideways():
     found = motion("sidewinding")
     assert 0.27 <= found.speed <= 0.32
@@ -78,7 +78,7 @@ def test_a_sidewinder_walks_sideways():
     assert abs(found.turns_per_s) < 0.02  # it walks, it doesn't roll
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rolling_turns_once_a_cycle_and_slips_a_little():
     found = motion("rolling")
     assert abs(found.turns_per_s) == pytest.approx(0.5, rel=0.01)
@@ -87,7 +87,7 @@ def test_rolling_turns_once_a_cycle_and_slips_a_little():
     assert 0.8 < found.speed / (2 * math.pi * 0.025 * 0.5) < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_helix_rolls_and_screws():
     found = motion("twist")
     assert 0.05 <= found.speed <= 0.11
@@ -95,7 +95,7 @@ def test_a_helix_rolls_and_screws():
     assert abs(found.forward) > 0.2 * found.speed  # obliquely, unlike rolling
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["horizontal", "vertical", "combined"])
 def test_waves_of_the_papers_equations_go_head_first_and_straight(name):
     found = motion(name)
@@ -112,13 +112,13 @@ def test_other_generators_settle_into_the_wave_of_flat(name):
     np.testing.assert_allclose(found[settled:], flat[settled:], atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators"])
 def test_the_same_wave_moves_the_body_alike_whatever_made_it(name):
     assert motion(name).forward == pytest.approx(motion("flat").forward, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_felt_servos_keep_the_wave_and_slow_it_a_little():
     # The responses follow their commands with gains near 1: see the closed form of the drift,
     # -eps^2 g^2 / 2 omega, in test_gait_oscillators.

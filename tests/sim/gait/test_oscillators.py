@@ -111,7 +111,7 @@ def test_a_one_way_chain_settles_in_sequence(make_robot):
     np.testing.assert_allclose(theta[:, 1] + PSI - theta[:, 0], expected, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("ratio", [0.5, 0.99, 1.01, 2.0])
 def test_a_detuned_pair_locks_up_to_twice_the_coupling(make_robot, ratio):
     # d = phi_2 - phi_1 - psi: d' = dw - 2 K sin d. Locked: d = asin(dw / 2K); else it drifts with

@@ -83,7 +83,7 @@ def test_the_chain_lies_where_the_kinematics_has_it_and_moves_as_the_engine_says
     assert np.abs(theirs.angle).max() > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("engine", EngineKind)
 def test_a_run_is_the_same_within_rounding(make_scenario, uneven, engine):
     # No chaotic growth: a gait on the ground is a stable cycle, errors are damped as they arise.
@@ -115,7 +115,7 @@ def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
     assert "numba" in set(facts) - {"kernels"}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("package", "words"),
     [("numba", "--kernels numba"), ("mujoco", ""), ("numba", "--kernels auto")],

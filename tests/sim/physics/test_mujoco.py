@@ -43,7 +43,7 @@ def apart(ones, others):
     [
         pytest.param(LATERAL, FrictionLaw.ELLIPSE, id="lateral-ellipse"),
         *(
-            pytest.param(gait, law, id=f"{name}-{law}", marks=pytest.mark.slow)
+            pytest.param(gait, law, id=f"{name}-{law}", marks=pytest.mark.nightly)
             for name, gait in (("lateral", LATERAL), ("sidewinding", SIDEWINDING))
             for law in FrictionLaw
             if (gait, law) != (LATERAL, FrictionLaw.ELLIPSE)
@@ -60,7 +60,7 @@ def test_engines_agree_after_six_seconds_on_the_ground(make_scenario, make_robot
     np.testing.assert_allclose(mujoco[-1].energy, bullet[-1].energy, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_engines_agree_between_obstacles(make_scenario, make_robot):
     obstacles = (
         Cylinder(position=(0.2, 0.03), radius=0.05),
@@ -73,7 +73,7 @@ def test_engines_agree_between_obstacles(make_scenario, make_robot):
     np.testing.assert_allclose(mujoco[-1].energy, bullet[-1].energy, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_engines_agree_on_a_body_that_rolls_over(make_scenario, make_robot):
     gait = Serpentine(ROLLING, 2.0)
     bullet, mujoco = both(make_scenario(make_robot(), gait=gait, duration_s=6.0))

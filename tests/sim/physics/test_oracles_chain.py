@@ -88,7 +88,7 @@ def linear_response(servo, mass, omega):
     return np.linalg.solve(jw**2 * mass + from_angle * joints, from_command * held * joints)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("stall_torque", [0.25, 1.5])
 def test_joints_respond_as_the_linear_chain(make_robot, make_scenario, stall_torque):
     frequency_hz, m = 1.0, 5

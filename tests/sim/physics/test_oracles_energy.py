@@ -90,8 +90,8 @@ def folding(make_robot, make_scenario):
     "servo",
     [
         pytest.param(WEAK, id="weak"),
-        pytest.param(STRONG, id="strong", marks=pytest.mark.slow),
-        pytest.param(STICKY, id="sticky", marks=pytest.mark.slow),
+        pytest.param(STRONG, id="strong", marks=pytest.mark.nightly),
+        pytest.param(STICKY, id="sticky", marks=pytest.mark.nightly),
     ],
 )
 def test_every_flow_and_store_of_the_joints_is_exact(folding, servo):
@@ -120,7 +120,7 @@ def test_a_thrown_robot_changes_speed_into_height(make_robot, make_scenario):
     assert energy["potential"] == pytest.approx(n * 0.1 * g * height, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "name", ["flat", "weak-servo-pi3", "snake13-vertical-pi3", "sidewinding", "rolling", "twist"]
 )

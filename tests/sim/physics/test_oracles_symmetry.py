@@ -14,7 +14,7 @@ from support.twin_runs import simulate
 from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 FORWARD, REVERSE = "weak-servo-pi3", "weak-servo-pi3-reverse"
 

@@ -136,7 +136,7 @@ def test_a_long_and_finely_divided_chain_is_a_slender_body(a):
     np.testing.assert_allclose(chain, slender_body(lag, a), rtol=6e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("case", "ratio"), CASES.items())
 def test_the_twin_swims_as_the_overdamped_chain(run_twin, case, ratio):
     speed, power, tracking = run_twin(*case)
@@ -149,7 +149,7 @@ def test_the_twin_swims_as_the_overdamped_chain(run_twin, case, ratio):
     assert power == pytest.approx(chain[1], rel=1e-2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_is_left_over_goes_with_the_step(run_twin):
     case = (13, math.radians(90), 0.37)
     chain = overdamped_chain(*case, steps=1000)[0]
@@ -158,7 +158,7 @@ def test_what_is_left_over_goes_with_the_step(run_twin):
     assert abs(2 * half - whole) < 1e-5 * chain  # what would be left without a step
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_at_small_amplitude_speed_goes_with_its_square(run_twin):
     # Liljebäck et al., IROS 2010, of viscous ground: twice the amplitude, four times the speed.
     links, lag, a = 13, math.radians(30), 0.03

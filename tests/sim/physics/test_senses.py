@@ -101,7 +101,7 @@ def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_pat
         assert session.warnings == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
     make_scenario, make_robot
 ):

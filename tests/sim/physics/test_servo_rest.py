@@ -103,7 +103,7 @@ def test_it_needs_no_shorter_step(make_scenario, make_robot):
     assert stability(resting)[Plane.HORIZONTAL].parts["servo.coulomb_friction"] == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rotors_rest_at_every_reversal_and_the_ledger_closes_on_all_engines_and_kernels(
     make_robot, make_scenario
 ):

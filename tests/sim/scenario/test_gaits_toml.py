@@ -78,7 +78,7 @@ def read(text, robot=ROBOT):
     return gait, {fault.key: str(fault) for fault in faults.all()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @given(gait=gaits)
 @settings(max_examples=200, deadline=None)
 def test_whatever_is_written_reads_back_the_same(gait):

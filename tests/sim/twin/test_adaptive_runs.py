@@ -57,7 +57,7 @@ def recorded(tmp_path_factory):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_joints_beside_a_wall_swing_less_and_recover(recorded):
     """The paper's figure of the side sensors: the shrinking passes down the body with the wall."""
     log = recorded("side-sensor-amplitude")
@@ -74,7 +74,7 @@ def test_joints_beside_a_wall_swing_less_and_recover(recorded):
     assert log.energy["obstacle_friction"][-1] == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_avoidance_goes_through_its_modes_and_touches_nothing(recorded):
     """A gate shrinks the sides and hastens the tail in it; the cylinder behind is avoided."""
     log = recorded("avoidance")
@@ -94,7 +94,7 @@ def test_avoidance_goes_through_its_modes_and_touches_nothing(recorded):
     assert abs(log.y[np.argmax(log.x > 4.0)]) > 0.15 + 0.025
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_adaptive_amplitude_touches_a_corridor_for_less_time():
     """The same corridor with and without shrinking: both get through, one scrapes less."""
     scenario = load_scenario("corridor")
@@ -112,7 +112,7 @@ def test_adaptive_amplitude_touches_a_corridor_for_less_time():
     assert contact_s[0.3] < 0.75 * contact_s[1.0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_reckoning_and_course_lead_to_a_target_on_free_ground():
     """Truth from the body's dynamics: reckoned within 5 % of the way, compass errors and all."""
     scenario = load_scenario("target-following")
@@ -154,7 +154,7 @@ def test_the_median_interval_covers_as_often_as_it_says(study):
 
 
 @pytest.mark.built("tables")
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Two of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""
     limits_s = {"target-following": 90.0, "random-walk": 30.0}

@@ -35,7 +35,7 @@ def two_cycles(make_scenario, make_robot):
     return {degrees: speed(math.radians(degrees)) for degrees in (0, 30, 45, 90)}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("degrees", [30, 45, 90])
 def test_speed_does_not_depend_on_the_heading(two_cycles, degrees):
     reference, turned = two_cycles[0], two_cycles[degrees]
@@ -53,7 +53,7 @@ SIDEWINDING = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("planes", "backlash"),
     [(LATERAL, 0.0), (CATERPILLAR, 0.0), (SIDEWINDING, 0.0), (LATERAL, 0.03)],
@@ -109,7 +109,7 @@ def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
         simulate(make_scenario(make_robot(3), amplitude=0.0, world=world))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lags_agree_with_an_independent_program(make_scenario, make_robot, response):
     # An earlier program of the same equations, with PyBullet and with MuJoCo as its engine:
     # 7.46 degrees at the ends and 13.66 in the middle, with the friction law "transeth".

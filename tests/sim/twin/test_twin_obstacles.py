@@ -78,7 +78,7 @@ def forest(make_scenario, make_robot):
     return make_scenario(robot, gait=gait, duration_s=4.0, world=world)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_power_closes_among_obstacles(forest):
     last = simulate(forest)[-1]
     energy = energies(last)
@@ -97,7 +97,7 @@ def test_power_closes_among_obstacles(forest):
     assert energy["mechanical_net"] == pytest.approx(spent + energy["mechanical_residual"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_both_engines_meet_the_same_obstacles(forest):
     scenario = dataclasses.replace(forest, duration_s=1.5)
     ours, theirs = (
