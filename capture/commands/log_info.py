@@ -229,7 +229,7 @@ def log_check(
     (file,) = paths
     with progress(f"checking {file.name}", 1.0) as bar:
         health = check_session(file, bar.update, topics=topics.names)
-    emit(as_json(health), _check_lines(health), as_json=json)
+    emit(as_json(health) if json else {}, _check_lines(health), as_json=json)
     return int(health.verdict == "bad")
 
 

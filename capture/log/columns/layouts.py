@@ -104,8 +104,9 @@ class LayoutSorter:
                 is_kept = (self._kept_in_all if self._in_all else len(kept)) < self._most
                 if is_kept:
                     kept.append((number, layout))
-                    fits = _fits(matrix, layout)
-                    rest = ~fits
+                    if len(rows) > 1:  # one message fits its own layout
+                        fits = _fits(matrix, layout)
+                        rest = ~fits
                 self._found += 1
                 self._kept_in_all += is_kept
                 self.is_full |= not is_kept

@@ -125,6 +125,8 @@ class TimingTally:
             steps, starts = np.diff(t_ns), t_ns[:-1]
         self._count += len(t_ns)
         self._first, self._last, self._previous = low, high, int(t_ns[-1])
+        if not len(steps):  # a first sample alone
+            return
         self._duplicates += int((steps == 0).sum())
         self._backward += int((steps < 0).sum())
         forward = steps > 0
@@ -244,6 +246,10 @@ class SequenceTally:
             sequence: In the order of the file, shape (n,).
         """
         if not len(sequence):
+            return
+        if not self._count and len(sequence) == 1:
+            self._previous, self._count = int(sequence[0]), 1
+            self._nonzero = self._previous != 0
             return
         before = self._previous if self._count else int(sequence[0])
         steps = np.diff(sequence, prepend=before)
