@@ -270,6 +270,23 @@ def opened():
         yield lambda path: stack.enter_context(Session.open(path))
 
 
+@pytest.fixture(scope="module")
+def programs(request):
+    """Runs programs on a disk that forgets what isn't synced; the module's START is run once."""
+    from support.forgetting_disk import Programs
+
+    with Programs(request.module.START) as running:
+        yield running
+
+
+@pytest.fixture
+def disk(tmp_path, programs):
+    """That disk."""
+    from support.forgetting_disk import ForgettingDisk
+
+    return ForgettingDisk(tmp_path, programs)
+
+
 @pytest.fixture
 def disk_of(tmp_path):
     """Mounts a file system of a size, e.g. ``4m``; skips where that is not permitted."""

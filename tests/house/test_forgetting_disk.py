@@ -2,9 +2,7 @@
 
 import errno
 
-import pytest
-
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import Loss
 
 START = "import ctypes, mmap, os, signal, sys"
 
@@ -43,17 +41,6 @@ written("last", b"seven")
 os.unlink("late")
 os.kill(os.getpid(), signal.SIGKILL)
 """
-
-
-@pytest.fixture(scope="module")
-def programs():
-    with Programs(START) as running:
-        yield running
-
-
-@pytest.fixture
-def disk(tmp_path, programs):
-    return ForgettingDisk(tmp_path, programs)
 
 
 def contents(folder):

@@ -1,6 +1,6 @@
 """Saved recordings on a disk that forgets what wasn't synced."""
 
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import Loss
 
 START = """
 import os, signal, sys
@@ -18,12 +18,10 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_a_file_that_replaces_another_is_whole_under_its_name(tmp_path):
+def test_a_file_that_replaces_another_is_whole_under_its_name(disk):
     """The name needn't have reached the disk: then the former file is there."""
-    with Programs(START) as programs:
-        disk = ForgettingDisk(tmp_path, programs)
-        (disk.root / "run.rrd").write_bytes(b"old")
-        disk.settle()
-        disk.run(WRITTEN, disk.root / "run.rrd")
+    (disk.root / "run.rrd").write_bytes(b"old")
+    disk.settle()
+    disk.run(WRITTEN, disk.root / "run.rrd")
     assert (disk.after(Loss.EVERYTHING) / "run.rrd").read_bytes() == b"old"
     assert (disk.after(Loss.BYTES) / "run.rrd").read_bytes() == b"new " * 100_000

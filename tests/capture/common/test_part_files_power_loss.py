@@ -2,7 +2,7 @@
 
 import pytest
 
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import ForgettingDisk, Loss
 
 OLD, NEW = b"old " * 3000, b"new " * 5000
 
@@ -19,17 +19,6 @@ part.write_bytes(b"new " * 5000)
 publish_durably(part, output, replace=replace)
 os.kill(os.getpid(), signal.SIGKILL)
 """
-
-
-@pytest.fixture(scope="module")
-def programs():
-    with Programs(START) as running:
-        yield running
-
-
-@pytest.fixture
-def disk(tmp_path, programs):
-    return ForgettingDisk(tmp_path, programs)
 
 
 @pytest.mark.parametrize("replace", [False, True])

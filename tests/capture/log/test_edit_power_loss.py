@@ -1,9 +1,7 @@
 """Edited logs on a disk that forgets what wasn't synced: the sources may be deleted then."""
 
-import pytest
-
 from support import durable_child as recorder
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import Loss
 from support.read_back import read
 
 START = """
@@ -16,14 +14,7 @@ path = lambda name: Path(sys.argv[1], name)
 """
 
 
-@pytest.fixture(scope="module")
-def programs():
-    with Programs(START) as running:
-        yield running
-
-
-def test_a_recovered_log_is_there_once_its_sources_may_be_deleted(tmp_path, programs):
-    disk = ForgettingDisk(tmp_path, programs)
+def test_a_recovered_log_is_there_once_its_sources_may_be_deleted(disk):
     killed = """
 sink = recorder.open_sink(path("run.mcap"), segment_size=1 << 18, ballast=0)
 for number in range(500):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import Loss
 from support.wal_messages import CHANNEL, check_messages
 from undulog.capture.log.wal.reader import recover
 
@@ -26,17 +26,6 @@ def lose_power():
     os.kill(os.getpid(), signal.SIGKILL)
 
 """
-
-
-@pytest.fixture(scope="module")
-def programs():
-    with Programs(START) as running:
-        yield running
-
-
-@pytest.fixture
-def disk(tmp_path, programs):
-    return ForgettingDisk(tmp_path, programs)
 
 
 def check(disk, count):

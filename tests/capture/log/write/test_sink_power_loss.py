@@ -5,7 +5,7 @@ from operator import itemgetter
 import pytest
 
 from support import durable_child as recorder
-from support.forgetting_disk import ForgettingDisk, Loss, Programs
+from support.forgetting_disk import ForgettingDisk, Loss
 from support.read_back import messages_of, read, rows_of
 
 START = """
@@ -33,17 +33,6 @@ def go_on(sink, count):
         recorder.write(sink, number)
 
 """
-
-
-@pytest.fixture(scope="module")
-def programs():
-    with Programs(START) as running:
-        yield running
-
-
-@pytest.fixture
-def disk(tmp_path, programs):
-    return ForgettingDisk(tmp_path, programs)
 
 
 def names(folder):
