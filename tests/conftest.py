@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("undulog", deadline=None)  # no test is timed
+EXAMPLES = int(os.environ.get("UNDULOG_EXAMPLES") or 30)
+settings.register_profile("undulog", deadline=None, max_examples=EXAMPLES)  # no test is timed
 settings.load_profile("undulog")
 pytest.register_assert_rewrite("support")
 pytest_plugins = ["support.clock_tests"]

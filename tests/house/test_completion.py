@@ -45,6 +45,7 @@ def test_bash_completes_commands_options_and_choices(home, words, expected):
     assert {line.strip() for line in done.stdout.split()} == expected, done.stderr
 
 
+@pytest.mark.slow
 def test_the_scripts_of_other_shells_parse(home):
     for shell, pattern in (("zsh", ".zsh/**/*undulog"), ("fish", ".config/fish/**/*.fish")):
         (script,) = home.glob(pattern)

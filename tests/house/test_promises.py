@@ -78,8 +78,8 @@ def promises():
 
 def marks_of(function):
     """Names of the markers of a test function."""
-    words = [ast.unparse(each).removeprefix("pytest.mark.") for each in function.decorator_list]
-    return {word.partition("(")[0] for word in words}
+    marks = [ast.unparse(node).removeprefix("pytest.mark.") for node in function.decorator_list]
+    return {mark.partition("(")[0] for mark in marks}
 
 
 @pytest.mark.parametrize("promise", promises())

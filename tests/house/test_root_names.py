@@ -126,6 +126,7 @@ def test_the_command_has_one_thread_of_linear_algebra_unless_told():
     assert threads_of_numpy(OPENBLAS_NUM_THREADS="2") == 2
 
 
+@pytest.mark.slow
 def test_a_notebook_has_one_thread_of_linear_algebra_while_it_analyses(runs, monkeypatch):
     seen, analyse_session = [], undulog.analysis.analyse_session
 

@@ -121,6 +121,7 @@ def test_a_message_that_only_one_has_is_a_difference(tmp_path):
     assert (found.exact, found.differs_s, found.messages) == (False, {"/mode": 3.0}, 3)
 
 
+@pytest.mark.slow
 def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
     again(room, tmp_path / "a.mcap", "--duration", "0.5", "--set", "servo.stall_torque=0.3")
     assert "Not compared: " in capsys.readouterr().out

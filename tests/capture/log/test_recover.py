@@ -126,7 +126,7 @@ def _kill_at(child, path, size):
     child.kill()
 
 
-@pytest.mark.parametrize("runs", [6, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [3, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
     rng = random.Random(8)
     whole = 0
@@ -477,7 +477,7 @@ def damage(rng, folder):
 
 
 @pytest.mark.parametrize(
-    ("runs", "total"), [(40, 900), pytest.param(500, 300, marks=pytest.mark.slow)]
+    ("runs", "total"), [(12, 900), pytest.param(500, 300, marks=pytest.mark.slow)]
 )
 def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(
     tmp_path, runs, total

@@ -131,7 +131,7 @@ def test_ticks_of_a_long_stop_are_left_out_and_counted(tmp_path):
     assert sum("did not run for 3.00 s" in text for text in texts) == 1
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(late_s=st.lists(st.floats(0.0, 3.0), max_size=30), seed=st.integers(0, 2**32))
 def test_whatever_is_late_each_frame_is_kept_once_and_no_tick_is_early(
     tmp_path_factory, late_s, seed

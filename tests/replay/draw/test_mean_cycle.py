@@ -118,6 +118,7 @@ def test_the_twins_settled_motion_is_its_mean_cycle(twin):
         np.testing.assert_allclose(values[last], drawn, atol=1.5e-3)
 
 
+@pytest.mark.nightly
 def test_the_twins_interval_is_as_narrow_as_its_cycles_agree(twin):
     _, _, recorded = twin
     low = rows(recorded, "/ensemble/places/head/low")

@@ -168,6 +168,7 @@ def test_every_session_keeps_its_entities_under_its_own_name(
     assert others == {"robot", "twin", "compared"}
 
 
+@pytest.mark.nightly
 def test_sessions_lie_at_their_own_time_and_at_their_own_phase(beside):
     for name, wave in (("robot", ROBOT), ("twin", TWIN)):
         entity = f"/{name}/joints/measured"

@@ -21,6 +21,8 @@ from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.scenario.scenario_file import scenario_names
 from undulog.sim.scenario.world import Push
 
+pytestmark = pytest.mark.slow  # the first of them waits for its compiler, half a minute
+
 LAWS = [FrictionLaw.TRANSETH, FrictionLaw.ELLIPSE, FrictionLaw.BOX, FrictionLaw.VISCOUS, None]
 
 

@@ -270,6 +270,7 @@ def test_feedback_against_scipy(make_robot):
     np.testing.assert_allclose(theta, found, atol=1e-7)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("bias", [0.0, 0.5, 1.0])
 def test_feedback_settles_where_the_mean_response_equals_the_bias(make_robot, bias):
     # Of q = g A sin(phi + delta) a cycle of 2 (q/A) cos(phi) leaves g sin(delta). Here q keeps its

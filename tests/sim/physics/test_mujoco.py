@@ -41,7 +41,7 @@ def apart(ones, others):
 @pytest.mark.parametrize(
     ("gait", "law"),
     [
-        pytest.param(LATERAL, FrictionLaw.ELLIPSE, id="lateral-ellipse"),
+        pytest.param(LATERAL, FrictionLaw.ELLIPSE, id="lateral-ellipse", marks=pytest.mark.nightly),
         *(
             pytest.param(gait, law, id=f"{name}-{law}", marks=pytest.mark.nightly)
             for name, gait in (("lateral", LATERAL), ("sidewinding", SIDEWINDING))
