@@ -324,16 +324,16 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
-    from undulog.capture.common.streams import prepare_streams
-
-    prepare_streams()
     if "--help" in sys.argv:
         gc.disable()  # a seventh of the time, and the process ends with the help
-    if not sys.stderr.isatty():
-        os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     for name in _OF_LINEAR_ALGEBRA:
         os.environ.setdefault(name, "1")
     try:
+        from undulog.capture.common.streams import prepare_streams
+
+        prepare_streams()
+        if not sys.stderr.isatty():
+            os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
         from undulog.capture.common.extras import defer
 
         defer()

@@ -61,7 +61,6 @@ class QueryProcess:
         self._lock = Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
-        self._environment: dict[str, str] = {}
 
     def run(self, where: str, query: str) -> Any:
         """Run a query over a catalogue.
@@ -80,7 +79,8 @@ class QueryProcess:
         if len(query) > _LONGEST:
             raise UsageError(f"DuckDB: a query of {len(query)} characters, over {_LONGEST}")
         with self._lock:
-            answer = self._ask(pickle.dumps((where, query)))
+            # Names of servers and keys may have changed since the last one.
+            answer = self._ask(pickle.dumps((where, query, dict(os.environ))))
         if isinstance(answer, Refused):
             raise answer.error()
         return answer
@@ -90,8 +90,6 @@ class QueryProcess:
         self._end()
 
     def _ask(self, request: bytes) -> Any:
-        if self._environment != os.environ:  # names of servers and keys may have changed
-            self._end()
         connection, whole = self._connection or self._start(), False
         try:
             connection.send_bytes(request)
@@ -106,7 +104,7 @@ class QueryProcess:
 
     def _start(self) -> Connection:
         connection, other = Pipe()
-        self._connection, self._environment = connection, dict(os.environ)
+        self._connection = connection
         with other:
             self._process = subprocess.Popen(  # noqa: S603  our own arguments
                 [sys.executable, "-P", "-c", _PROGRAM, str(other.fileno())],

@@ -29,9 +29,14 @@ def main(handle: int) -> None:
     catalogs: dict[str, Catalog] = {}
     while True:
         try:
-            where, query = pickle.loads(connection.recv_bytes())  # noqa: S301  of our own process
+            request = pickle.loads(connection.recv_bytes())  # noqa: S301  of our own process
         except (EOFError, OSError):
             return
+        where, query, environment = request
+        if environment != os.environ:  # a catalogue's server and keys may be others now
+            os.environ.clear()
+            os.environ.update(environment)
+            catalogs.clear()
         answer: Any
         try:
             if where not in catalogs:
