@@ -69,8 +69,17 @@ DAMAGES = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("damage", DAMAGES)
+FAST = {("flipped", "sessions"), ("cut", "joints"), ("empty", "analyses"), ("folder", "sources")}
+
+
+@pytest.mark.parametrize(
+    ("damage", "kind"),
+    [
+        pytest.param(damage, kind, marks=() if (damage, kind) in FAST else pytest.mark.slow)
+        for damage in DAMAGES
+        for kind in KINDS
+    ],
+)
 def test_a_damaged_file_is_set_aside_and_its_rows_are_read_again(lab, kind, damage):
     """Whichever file of a kind it is, also that of what was removed."""
     before = Catalog(str(lab)).find()

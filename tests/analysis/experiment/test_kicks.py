@@ -151,7 +151,9 @@ def test_the_nonlinearity_of_a_cubic_servo_in_closed_form():
     assert index.ci95 == pytest.approx((1 - g, 1 - g), rel=1e-5)
 
 
-@pytest.mark.parametrize("b", [0.0, 0.1, 0.8])
+@pytest.mark.parametrize(
+    "b", [0.1, *(pytest.param(b, marks=pytest.mark.nightly) for b in (0.0, 0.8))]
+)
 def test_the_interval_of_the_nonlinearity_covers(b):
     H, command = planted()
     size = abs(command[0]) ** 2
@@ -192,7 +194,7 @@ def test_the_linear_reading_gives_back_what_was_planted(reciprocal):
     assert np.linalg.norm(P.value - P.value.T) > 0.1
 
 
-@pytest.mark.parametrize("reciprocal", [True, False])
+@pytest.mark.parametrize("reciprocal", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_the_intervals_of_the_linear_reading_cover(reciprocal):
     """Also where the truth is zero: a reciprocal chain has no asymmetry, noise has."""
     H, command = planted(reciprocal=reciprocal)
