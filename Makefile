@@ -51,7 +51,8 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 # has the tests of processes, time and pictures.
 ANALYSIS = tests/analysis
 COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py \
-  $(addprefix tests/capture/,following robot) \
+  $(addprefix tests/capture/log/,file health) \
+  $(addprefix tests/capture/,bus following robot) \
   $(addprefix tests/replay/,calibrate draw overlay sweep) \
   $(addprefix tests/replay/test_,clip.py reproduce.py) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
