@@ -243,7 +243,7 @@ class Catalog:
             self._files.write("sources", sources)
         complete, set_aside = read == len(fresh), list[str]()
         if damaged_files and complete:
-            self._remove(self._halves(), scanned_ns)
+            self._remove(settled(self._halves), scanned_ns)
             set_aside = self._files.set_damaged_aside()
         if complete:
             self._files.put_together()

@@ -34,7 +34,7 @@ _MOST_FILES = 64
 """Parquet files of a kind from which on they are put into one,"""
 _MOST_ROWS = 50_000
 """and their rows."""
-_ATTEMPTS = 5
+_ATTEMPTS = 10
 """How often files are listed anew because another process put them together meanwhile."""
 _CURE = "; a scan of the catalogue sets it aside and reads the sessions again"
 

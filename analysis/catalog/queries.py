@@ -24,6 +24,8 @@ from undulog.capture.common.errors import InputFileError, UndulogError, UsageErr
 
 CPU_S = 15
 """Processor time of a query [s]; one over a million sessions takes less than one."""
+_RELEASE_S = 30.0
+"""Longest wait for a process that the kernel is ending [s]."""
 _LONGEST = 100_000
 """Characters of a query."""
 _PROGRAM = f"import sys; from {__package__}.query_child import main; main(int(sys.argv[1]))"
@@ -96,7 +98,8 @@ class QueryProcess:
             answer = connection.recv_bytes()
             whole = True
         except (EOFError, OSError):
-            return Refused(UsageError.__name__, "", f"DuckDB: {self._end()}")
+            # It is ending; on a busy computer the kernel takes its time to release its memory.
+            return Refused(UsageError.__name__, "", f"DuckDB: {self._end(_RELEASE_S)}")
         finally:
             if not whole:  # also where the user ends it
                 self._end()
@@ -116,8 +119,8 @@ class QueryProcess:
             )
         return connection
 
-    def _end(self) -> str:
-        """End the process; return why it has ended, if it had."""
+    def _end(self, patience_s: float = 1.0) -> str:
+        """End the process, which has some time to do so itself; return why it has ended."""
         connection, process = self._connection, self._process
         self._connection = self._process = None
         if connection is not None:
@@ -125,7 +128,7 @@ class QueryProcess:
         if process is None:
             return TOO_LARGE
         try:
-            code = process.wait(1.0)
+            code = process.wait(patience_s)
         except subprocess.TimeoutExpired:
             process.kill()
             code = process.wait()

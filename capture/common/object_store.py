@@ -142,7 +142,7 @@ class ObjectStore:
                 entries = [*os.scandir(self.path(folder))]
             except FileNotFoundError:
                 return []
-        names = (e.name for e in entries if e.name.endswith(ending) and not is_file(Path(e)))
+        names = (e.name for e in entries if e.name.endswith(ending) and _is_no_file(e))
         return sorted(f"{folder}/{name}" for name in names)
 
     def _listed(self, folder: str, *, recursive: bool = False) -> list[Any]:
@@ -319,3 +319,10 @@ class ObjectStore:
             suppress(FileNotFoundError),
         ):
             self.filesystem.delete_file(self.path(name))
+
+
+def _is_no_file(entry: os.DirEntry[str]) -> bool:
+    """Whether it is there and no file; one that was removed since the listing is neither."""
+    if entry.is_file(follow_symlinks=False) or is_file(Path(entry)):
+        return False
+    return os.path.lexists(entry)

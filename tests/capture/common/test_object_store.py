@@ -65,6 +65,20 @@ def test_a_folder_in_the_place_of_a_file_is_found(store, tmp_path):
     assert goal.endswith(".damaged")
 
 
+def test_a_file_that_is_removed_during_the_listing_is_not_taken_for_something_else(
+    store, tmp_path, monkeypatch
+):
+    name, scandir = store.write_table("rows/1", TABLE), os.scandir
+
+    def listed(folder):
+        entries = [*scandir(folder)]
+        (tmp_path / name).unlink()
+        return entries
+
+    monkeypatch.setattr(os, "scandir", listed)
+    assert store.not_files("rows", ".parquet") == []
+
+
 @pytest.mark.slow
 def test_a_file_without_a_checksum_is_read_and_found_damaged_where_it_can_t_be(store, tmp_path):
     path = tmp_path / "rows" / "1790000000000000000-0123abcd.parquet"
