@@ -204,10 +204,18 @@ def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(monkeypatch):
     """As after Ctrl-S: nobody reads, the kernel's buffer is full, a write waits for ever."""
     monkeypatch.setenv("TERM", "xterm-256color")
     with terminal() as (ours, stream):
+        refused = 0
+
+        def is_full():  # the kernel moves what was written on, and has room again
+            nonlocal refused
+            with suppress(BlockingIOError):
+                while os.write(stream.fileno(), b"earlier output\n"):
+                    refused = 0
+            refused += 1
+            return refused > 50
+
         os.set_blocking(stream.fileno(), False)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(stream.fileno(), b"earlier output\n")
+        wait_for(is_full, "a full terminal")
         os.set_blocking(stream.fileno(), True)
         shown = Terminal(stream)
         for second in range(200):

@@ -25,6 +25,7 @@ def swept(plan, output, *words):
     """Run a sweep by one worker, whose start takes as long as a few runs; return its report."""
     done = undulog("sweep", plan, "-o", output, "--json", "--workers", "1", *words)
     assert done.stdout, done.stderr
+    assert done.returncode >= 0, done.stderr
     return json.loads(done.stdout), done.returncode
 
 
@@ -170,13 +171,13 @@ def test_a_sweep_that_was_interrupted_twice_goes_on_where_it_stopped(signals, re
             workers = _workers(sweep.pid)
             assert len(workers) == 2
             sweep.send_signal(signal.Signals[name])
-            out, _ = sweep.communicate(timeout=60)
+            out, errors = sweep.communicate(timeout=60)
         there = len(rows_of(tmp_path / "rows"))
         assert before < there < 10
         if name != "SIGKILL":
             report = json.loads(out)
             assert (report["run"], report["there_before"]) == (there - before, before)
-            assert (report["complete"], sweep.returncode) == (False, 1)
+            assert (report["complete"], sweep.returncode) == (False, 1), errors
         wait_for(lambda: not any(map(alive, workers)), "workers end", 20)  # noqa: B023
         before = there
     rest, code = swept(plan, tmp_path / "rows")
