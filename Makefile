@@ -47,8 +47,8 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
-# Three processes at once: two of tests that compute, in the time that the third leaves them, which
-# has the tests of processes, time and pictures.
+# Four processes at once: two of tests that compute, in the time that the others leave them, which
+# have the tests of processes, time and pictures, and wait more than they compute.
 ANALYSIS = tests/analysis
 COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py \
   $(addprefix tests/capture/log/,file health) \
@@ -57,6 +57,7 @@ COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/tes
   $(addprefix tests/replay/test_,clip.py reproduce.py) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
+WAITING = tests/replay tests/sim
 # JUnit files, with the seconds of each test, lie in out/tests/.
 define tests
 	@mkdir -p out/tests; logs=$$(mktemp -d); \
@@ -64,11 +65,13 @@ define tests
 	  $(ANALYSIS) >$$logs/1 2>&1 & first=$$!; \
 	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-computing.xml \
 	  $(COMPUTING) >$$logs/2 2>&1 & second=$$!; \
-	trap "kill $$first $$second; rm -rf $$logs; exit 130" INT TERM; \
+	$(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-waiting.xml \
+	  $(addprefix --ignore=,$(COMPUTING)) $(WAITING) >$$logs/3 2>&1 & third=$$!; \
+	trap "kill $$first $$second $$third; rm -rf $$logs; exit 130" INT TERM; \
 	$(PYTEST) -m $(2) --junitxml out/tests/$(1).xml \
-	  $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING)); third=$$?; \
-	wait $$first; first=$$?; wait $$second; second=$$?; cat $$logs/*; rm -rf $$logs; \
-	exit $$((first + second + third))
+	  $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING) $(WAITING)); last=$$?; \
+	wait $$first; first=$$?; wait $$second; second=$$?; wait $$third; third=$$?; \
+	cat $$logs/*; rm -rf $$logs; exit $$((first + second + third + last))
 endef
 
 test: $(READY)  ## all tests but the slow ones and those of real time

@@ -10,7 +10,7 @@ from undulog.capture.common.palette import joint_colors
 from undulog.replay.layout import build_views
 from undulog.replay.recording import write_recording
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 SECONDS = 1.6
 

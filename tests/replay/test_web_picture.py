@@ -15,7 +15,7 @@ import undulog
 from support import golden_pictures
 from support.processes import served_page, wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 WIDTH, HEIGHT = 1440, 900
 SECONDS = 1.0

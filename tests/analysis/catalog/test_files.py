@@ -75,7 +75,7 @@ FAST = {("flipped", "sessions"), ("cut", "joints"), ("empty", "analyses"), ("fol
 @pytest.mark.parametrize(
     ("damage", "kind"),
     [
-        pytest.param(damage, kind, marks=() if (damage, kind) in FAST else pytest.mark.slow)
+        pytest.param(damage, kind, marks=() if (damage, kind) in FAST else pytest.mark.nightly)
         for damage in DAMAGES
         for kind in KINDS
     ],

@@ -71,7 +71,7 @@ EVERY_KIND = in_order(
     for k, (bus, kind, extended, dlc, sent) in enumerate(KINDS)
     for size in [0 if kind == "remote" else dlc]
 )
-COUNTS = [2, pytest.param(60, marks=pytest.mark.slow)]
+COUNTS = [2, pytest.param(60, marks=pytest.mark.nightly)]
 
 
 def each_trace(check, count):

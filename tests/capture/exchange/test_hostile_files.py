@@ -182,6 +182,7 @@ def test_names_that_act_on_a_terminal(tmp_path):
     assert "joint\\x1b[31m\\u202e" in refused(path, *imported(path))
 
 
+@pytest.mark.nightly
 def test_damaged_metadata_of_a_parquet_file(tmp_path):
     """Thrift structures that no checksum guards: an uncaught exception ends the process."""
     whole = io.BytesIO()
@@ -226,6 +227,7 @@ def test_frames_that_are_computed(data, tmp_path):
     assert "computed columns" in reported
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["blf", "mf4", "db"])
 def test_damaged_logs_of_frames(kind, tmp_path):
     if kind == "mf4":

@@ -41,7 +41,13 @@ COMPUTED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", [("log", "info"), ("log", "check"), ("analyse",)])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("log", "info"),
+        *(pytest.param(v, marks=pytest.mark.nightly) for v in (("log", "check"), ("analyse",))),
+    ],
+)
 @pytest.mark.parametrize("name", COMPUTED)
 def test_messages_that_are_computed(verb, name, tmp_path):
     rows = 3000 if name == "zeros" else 2  # SQLite computes the others already as it writes them
