@@ -213,9 +213,13 @@ class ObjectStore:
         if tried or checksum_in(name) is None:
             self._try(name, data)
         try:
-            file = self._parquet.ParquetFile(self._arrow.BufferReader(data))
+            # In this thread alone: one of Arrow's that still holds the bytes while the interpreter
+            # ends takes the process with it ("terminate called without an active exception").
+            source = self._arrow.BufferReader(data)
+            file = self._parquet.ParquetFile(source, pre_buffer=False)
             names = file.schema_arrow.names
-            return file.read(None if columns is None else [n for n in columns if n in names])
+            chosen = None if columns is None else [n for n in columns if n in names]
+            return file.read(chosen, use_threads=False)
         except (self._arrow.ArrowException, OSError) as error:
             raise DamagedFileError(f"{self.where}/{name}", str(error)) from error
 
