@@ -9,6 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from select import select
+
+
+def _pause(duration_s: float) -> None:
+    """Wait by ``select``: ``time.sleep`` never returns under libfaketime, which sets clocks."""
+    select([], [], [], duration_s)
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,7 @@ class Clock:
 
     monotonic_ns: Callable[[], int] = time.monotonic_ns
     wall_ns: Callable[[], int] = time.time_ns
-    sleep: Callable[[float], None] = time.sleep
+    sleep: Callable[[float], None] = _pause
 
 
 REAL = Clock()
