@@ -1,7 +1,7 @@
 """The computer's clocks as an argument: what depends on time can be run at any time.
 
-Logic that waits, and that judges how late it is, takes a :class:`Clock`. A test gives it one that
-the test moves, with late ticks and pauses as inputs; everything else gives it :data:`REAL`.
+Logic that waits, and that judges how late it is, takes a :class:`Clock`. A test passes a clock
+whose time it sets, with late ticks and pauses as inputs; everything else passes :data:`REAL`.
 """
 
 from __future__ import annotations

@@ -213,8 +213,8 @@ class ObjectStore:
         if tried or checksum_in(name) is None:
             self._try(name, data)
         try:
-            # In this thread alone: one of Arrow's that still holds the bytes while the interpreter
-            # ends takes the process with it ("terminate called without an active exception").
+            # In this thread alone: a thread of Arrow's could still hold the bytes while the
+            # interpreter ends, which aborts the process.
             source = self._arrow.BufferReader(data)
             file = self._parquet.ParquetFile(source, pre_buffer=False)
             names = file.schema_arrow.names
