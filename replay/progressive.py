@@ -133,6 +133,11 @@ without a graphics card takes tens of seconds for a large stretch."""
 
 _VIEWER = "the Rerun viewer"
 _ADVICE = "it is frozen or too busy; the session is unchanged, so start the command again"
+ENDS_S = 3.0
+"""A viewer that severs the connection is given this time to end, e.g. by a signal [s].
+
+Its memory is given back between the two, which takes long on a busy computer.
+"""
 _TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
 _FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
@@ -219,8 +224,9 @@ class _Sink:
                 rec.flush(timeout_sec=_TAKE_S)
             except RuntimeError as error:
                 if time.monotonic() - begun < 0.5 * _TAKE_S:  # it did not run out of time
-                    time.sleep(_TAKE_S)  # a viewer that ends takes nothing some time before
-                    self.look()
+                    while time.monotonic() - begun < ENDS_S:
+                        self.look()
+                        time.sleep(_TAKE_S)
                     why = "the viewer runs but takes no more of the session"
                     raise UndulogError(f"{why}: {error}") from error
                 if still.reached():

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from support.witness import LateComputerError
+
 LOG = Path(__file__).with_name("log")
 
 
@@ -44,6 +46,21 @@ def test_that_fails():
 
 def test_of_no_clock():
     assert not LOG.exists()
+
+
+OTHER = Path(__file__).with_name("other")
+
+
+def test_that_saw_it_late(tmp_path):
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    OTHER.write_text(OTHER.read_text() + "x" if OTHER.exists() else "x")
+    if len(OTHER.read_text()) < 3:
+        raise LateComputerError("0.1 s")
+
+
+def test_that_sees_it_late_each_time():
+    raise LateComputerError("0.2 s")
 """
 
 
@@ -64,12 +81,13 @@ def test_only_a_late_computer_is_a_reason_to_run_a_test_again(tmp_path, monkeypa
         *("--junitxml", tmp_path / "junit.xml", tmp_path),
         env={"PATH": "", "PYTHONPATH": str(ROOT / "tests")},
     )
-    assert "1 failed, 2 passed, 1 not judged" in done.stdout, done
-    assert done.stdout.count("NOT JUDGED") == 1
+    assert "1 failed, 3 passed, 2 not judged" in done.stdout, done
+    assert done.stdout.count("NOT JUDGED") == 2
+    assert "each_time: not judged: this computer was late by 0.2 s; 0.2 s; 0.2 s" in done.stdout
     assert "test_that_is_never_judged: not judged: this computer was late by 0.0" in done.stdout
     junit = (tmp_path / "junit.xml").read_text()
     assert 'failures="1"' in junit
-    assert 'skipped="1"' in junit
+    assert 'skipped="2"' in junit
 
 
 @pytest.mark.parametrize("wait_s", [0.0005, 0.1])

@@ -3,12 +3,15 @@
 They run after all others. A test that fails while the witness was later than the test's tolerance
 says nothing of the product: it is run again, and after five such tries it ends as *not judged*,
 which is no pass and no failure. ``WHY`` says what a simulated clock can't do here.
+
+Any other test that has processes of its own, and one among them that saw the computer late, raises
+:class:`.witness.LateComputerError`: it is run again just so.
 """
 
 import pytest
 from _pytest.runner import runtestprotocol
 
-from support.witness import Witness
+from support.witness import LateComputerError, Witness
 
 TRIES = 5
 _witness = None
@@ -31,33 +34,52 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: tolerance_of(item) is not None)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(call):
+    """Note in the report of a test what it saw of a late computer."""
+    report = yield
+    seen = call.excinfo is not None and call.excinfo.errisinstance(LateComputerError)
+    report.late_computer = str(call.excinfo.value) if seen else ""
+    return report
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Run a test of real time as often as the witness says that the computer was late."""
-    global _witness  # noqa: PLW0603
-    tolerance_s = tolerance_of(item)
-    if tolerance_s is None:
-        return None
-    _witness = _witness or Witness()
+    """Run a test as often as the computer was late for it."""
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    late_s = []
-    while len(late_s) < TRIES:
-        _witness.late_s()
+    late = []
+    while len(late) < TRIES:
+        _begin_witness(item)
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        late_s.append(_witness.late_s())
-        if not any(report.failed for report in reports) or late_s[-1] <= tolerance_s:
+        if not (seen := _late_for(item, reports)):
             break
+        late.append(seen)
     else:
-        _set_not_judged(item, reports, late_s, tolerance_s)
+        _set_not_judged(item, reports, late)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
 
 
-def _set_not_judged(item, reports, late_s, tolerance_s):
-    late = ", ".join(f"{one:.3f}" for one in late_s)
-    why = f"not judged: this computer was late by {late} s, more than {tolerance_s:g} s"
+def _begin_witness(item):
+    global _witness  # noqa: PLW0603
+    if tolerance_of(item) is not None:
+        _witness = _witness or Witness()
+        _witness.late_s()
+
+
+def _late_for(item, reports):
+    """Return how the computer was too late for a test that failed; empty if it wasn't."""
+    failed = [report for report in reports if report.failed]
+    if (tolerance_s := tolerance_of(item)) is None or not failed:
+        return failed[0].late_computer if failed else ""
+    late_s = _witness.late_s()
+    return f"{late_s:.3f} s, more than {tolerance_s:g} s" if late_s > tolerance_s else ""
+
+
+def _set_not_judged(item, reports, late):
+    why = f"not judged: this computer was late by {'; '.join(late)}"
     path, line, _ = item.location
     for report in reports:
         if report.failed:

@@ -19,12 +19,15 @@ from mcap_ros2.decoder import DecoderFactory
 
 from support.processes import UNDULOG, process, serving, wait_for
 from support.twin_chains import snake4
+from support.witness import LateComputerError
 from support.written_sessions import write_commands
 from undulog.capture import load_robot
 
 LISTENER = Path(__file__).with_name("bus_listener.py")
 RATE_HZ = 100
 MARK = 0x7F0  # an identifier that nobody else uses
+SILENT = "the bus was silent: no joint was received for "
+MOST_GAP_S = 2 / RATE_HZ  # without a reply, after which three control ticks may find none
 STEP = math.radians(0.01)  # of a command on the bus
 JOINTS = ("joint01", "joint02", "joint03", "joint04")
 LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 1.0
@@ -118,6 +121,18 @@ class Stage:
         """Return the commands among the received frames."""
         return [one for one in self.lines if (one["name"] or "").endswith("_command")]
 
+    @property
+    def longest_gap_s(self):
+        """Return the longest time without a reply, from the first command on [s].
+
+        On the computer's clock, or on that of the bus: the listener may be late as well.
+        """
+        lines = self.lines
+        first_s = self.command_lines[0]["t_s"]
+        replies = [one for one in lines if (one["name"] or "").endswith("_state")]
+        times_s = [[one["t_s"], one["bus_s"]] for one in replies if one["t_s"] >= first_s]
+        return float(np.diff(times_s, axis=0).max())
+
     def _heard_of(self, words):
         """Count lines with some words, without reading each line as JSON many times a second."""
         return self._heard.read_bytes().count(words.encode()) if self._heard.exists() else 0
@@ -173,26 +188,23 @@ def staged(folder, scenario, *faults, pace="--wait"):
 
 
 class Driving:
-    """A drive over the bus of the small robot, with a listener."""
+    """A drive over the bus of the small robot, with a listener.
 
-    def __init__(self, start):
-        self._start, self._running = start, ExitStack()
-        self._anew()
+    Attributes:
+        silence: Whether a silent bus is what was ordered; else it says that the computer was late.
+    """
 
-    def _anew(self):
-        self._running.close()
-        self.stage, self.controller, self.path = self._start(self._running)
+    def __init__(self, start, *, silence=False):
+        self.silence, self._running = silence, ExitStack()
+        self.stage, self.controller, self.path = start(self._running)
 
     def begun(self, count=150):
-        """Wait until so many ticks were commanded; on a machine that stops for 30 ms begin anew."""
-        for left in (2, 1, 0):
-            try:
-                self.stage.wait_for_commands(self.controller, count)
-                break
-            except AssertionError as error:
-                if not left or "the bus was silent" not in str(error):
-                    raise
-            self._anew()
+        """Wait until so many ticks were commanded."""
+        try:
+            self.stage.wait_for_commands(self.controller, count)
+        except AssertionError as error:
+            self._check_silence(str(error))
+            raise
 
     def close(self):
         self._running.close()
@@ -202,9 +214,14 @@ class Driving:
         time.sleep(pause_s)
 
     def communicate(self):
-        out, err = self.controller.communicate(timeout=60)
+        out, err = self.controller.communicate(timeout=120)
         self.stage.settle()
+        self._check_silence(err or "")
         return out, err
+
+    def _check_silence(self, words):
+        if SILENT in words and not self.silence and self.stage.longest_gap_s > MOST_GAP_S:
+            raise LateComputerError(f"{self.stage.longest_gap_s:.3f} s, between two replies")
 
     def ended(self, code=1):
         """Wait for the end, and check all of it; returns output, errors and the session."""
@@ -212,7 +229,9 @@ class Driving:
         assert self.controller.returncode == code, (out, err)
         lines = self.stage.lines
         check_limits(lines)
-        return out, err, check_session(self.path, lines)
+        written = check_session(self.path, lines)
+        self._check_silence(str(written.said))
+        return out, err, written
 
 
 # -- what was on the bus ------------------------------------------------------------------------

@@ -21,6 +21,10 @@ LEAST_S = 0.001
 WINDOW_S = 1.0
 
 
+class LateComputerError(Exception):
+    """What a test saw of the computer by itself, so that it says nothing of the product."""
+
+
 class Lateness:
     """The longest time within :data:`WINDOW_S` for which a process had to wait, so far."""
 

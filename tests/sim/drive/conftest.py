@@ -25,7 +25,7 @@ def session(small, tmp_path_factory):
 def driving(small, session, tmp_path):
     """Drives of the small robot: a context that gives a :class:`Driving`."""
 
-    def started(*faults, scenario=small[1], recorded=session, plain=False, disk=None):
+    def started(*faults, scenario=small[1], recorded=session, plain=False, disk=None, **more):
         def start(running):
             folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a test may drive several times
             path = Path(tempfile.mkdtemp(dir=disk)) / "a.mcap" if disk else folder / "a.mcap"
@@ -34,6 +34,6 @@ def driving(small, session, tmp_path):
                 stage.on += "&plain=yes"
             return stage, running.enter_context(stage.replay(recorded, path)), path
 
-        return closing(gate_stage.Driving(start))
+        return closing(gate_stage.Driving(start, **more))
 
     return started

@@ -81,10 +81,8 @@ def check_missing(err, size):
     assert int(found[1]) + int(found[2]) == size
 
 
-def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
+def check_told(err, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
     """The robot came to its safe end, and that is in a whole session; its report and log."""
-    _, err = controller.communicate(timeout=120)
-    assert controller.returncode == 1, err
     assert err.startswith(f"error: the disk at {disk} is full or fails: {path}")
     assert "; the joints were brought straight within " in err
     assert not (path.parent / f"{path.name}.wal").exists()
@@ -95,7 +93,7 @@ def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
     health = written.metadata["undulog.health"]
     assert health["verdict"] == "bad"
     assert json.loads(health["reasons"])[0].startswith(f"the disk at {disk} is full")
-    return err, written
+    return written
 
 
 def test_a_disk_that_somebody_fills_brings_the_robot_down_first(driving, disk_of):
@@ -103,8 +101,9 @@ def test_a_disk_that_somebody_fills_brings_the_robot_down_first(driving, disk_of
     with driving(disk=disk) as drive:
         drive.begun()
         fill(disk)
-        err, _ = check_told(drive.controller, drive.path, disk)
-        drive.stage.settle()
+        _, err = drive.communicate()
+        assert drive.controller.returncode == 1, err
+        check_told(err, drive.path, disk)
         lines = drive.stage.lines
         assert "No space left on device" in err
         gate_stage.check_limits(lines)
@@ -118,7 +117,9 @@ def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of)
         words = (*UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={ready['port']}")
         words += ("--arm", "-o", path, "--duration", "600")
         with process(*words) as controller:
-            err, written = check_told(controller, path, disk, ramp_rate=0.5)
+            _, err = controller.communicate(timeout=120)
+            assert controller.returncode == 1, err
+    written = check_told(err, path, disk, ramp_rate=0.5)
     assert len(written.commands) > 1000
     check_missing(err, 1 << 24)
 

@@ -18,6 +18,7 @@ import pytest
 from support import gate_stage
 from support.gate_stage import SAFETY, Driving, Written, staged
 from support.processes import process
+from support.witness import LateComputerError
 
 NOTHING_MORE = "nothing more was sent; the servos hold their last commands"
 FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
@@ -55,11 +56,8 @@ def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(driving):
 
 @pytest.mark.slow
 def test_lost_replies_end_it_and_name_the_joint(driving):
-    for _ in range(3):
-        with driving(f"lost:joint02:1@{FAULT_AT_S}") as drive:
-            _, err, written = drive.ended()
-        if "the bus was silent" not in err:  # of a machine so busy that no reply came for 30 ms
-            break
+    with driving(f"lost:joint02:1@{FAULT_AT_S}") as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: joint02 is lost: no angle for more than 1 s; the joints were bro")
     check_told(written, "joint02 is lost: no angle for more than 1 s")
     gate_stage.check_ramp_down(written, "fault: ")
@@ -70,7 +68,8 @@ def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     holds = SAFETY | {"on_fault": '"hold"'}
     robot, scenario = gate_stage.robot_files(tmp_path / "holds", safety=holds)
     holding = gate_stage.commanded(tmp_path / "holding.mcap", robot, 60.0)
-    with driving(f"lost:1@{FAULT_AT_S}", scenario=scenario, recorded=holding) as drive:
+    lost = f"lost:1@{FAULT_AT_S}"
+    with driving(lost, scenario=scenario, recorded=holding, silence=True) as drive:
         _, err, written = drive.ended()
     assert err.startswith("error: the bus was silent: no joint was received for ")
     # On a busy machine three ticks may be silent before the fault begins, and joints come again.
@@ -108,10 +107,8 @@ def test_a_process_that_comes_late_does_not_jump(driving):
         drive.signal(signal.SIGSTOP, 2.2)
         drive.signal(signal.SIGCONT)
         _, err, written = drive.ended()
-    assert err.startswith("error: a control tick was 2.")
-    # What came meanwhile is found at once; on a busy machine the bus may seem silent for a moment.
-    assert re.search(
-        r"s late, more than 1\.5 s; (the servos held for \S+ s, then )?the joints were brought "
+    assert re.match(  # what came meanwhile is found at once
+        r"error: a control tick was 2\.\S* s late, more than 1\.5 s; the joints were brought "
         r"straight within ",
         err,
     )
@@ -295,6 +292,20 @@ def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
         _, err, written = drive.ended(code=0)
     assert "error" not in err
     assert not errors(written)
+
+
+@pytest.mark.slow
+def test_a_robot_that_comes_late_is_not_the_controllers_fault(driving):
+    """The listener tells these tests whether a bus was silent by itself."""
+    with driving() as drive:
+        drive.begun()
+        drive.stage.robot.send_signal(signal.SIGSTOP)
+        drive.signal(signal.SIGINT, 0.5)
+        drive.signal(signal.SIGINT)
+        drive.controller.wait(timeout=60)
+        drive.stage.robot.send_signal(signal.SIGCONT)
+        with pytest.raises(LateComputerError):
+            drive.ended()
 
 
 @pytest.mark.slow
