@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow night clock zoo campaign mutants study check format bench docs schemas pictures pages \
+.PHONY: help demo test slow night clock zoo campaign mutants delays study check format bench docs schemas pictures pages \
   pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
@@ -97,6 +97,9 @@ campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=20
 
 mutants: $(READY)  ## 210 small faults in the product: do the fast tests find them? resumable (SEED=2 COUNT=20)
 	PYTHONPATH=tests nice -n 5 $(BIN)/python -m mutants.run $(and $(SEED),--seed $(SEED)) $(and $(COUNT),--count $(COUNT))
+
+delays: $(READY)  ## delays of twice the tolerance in the product: do the tests of real time find them? (COUNT=2)
+	PYTHONPATH=tests $(BIN)/python -m mutants.delays $(and $(COUNT),--count $(COUNT))
 
 study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
 	$(BIN)/python studies/study/study.py $(if $(LONG),,--quick)

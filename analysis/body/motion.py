@@ -300,11 +300,12 @@ def _fit_for_null(
     return robot, gait, Plane(next(iter(planes)))
 
 
-def head_poses(session: SessionView, head: str, span: Span) -> Poses:
+def head_poses(session: SessionView, head: str, span: Span, beyond: int = 0) -> Poses:
     """Return the head's poses within a window.
 
     Args:
         head: Name of the head link.
+        beyond: So many more before and after it, to interpolate at its ends.
 
     Returns:
         The poses, their times from the window's origin.
@@ -318,7 +319,8 @@ def head_poses(session: SessionView, head: str, span: Span) -> Poses:
     table = tables[ODOMETRY_TOPIC]
     at_ns: IntArray = table.index.to_numpy(dtype=np.int64)
     i, j = np.searchsorted(at_ns, (start_ns, stop_ns))
-    table, t_ns = table.iloc[i:j], at_ns[i:j]
+    inner = slice(max(int(i) - beyond, 0), int(j) + beyond)
+    table, t_ns = table.iloc[inner], at_ns[inner]
     if table.empty or not set(_POSE) <= set(table.columns):
         raise DataError(f"{ODOMETRY_TOPIC} has no poses within the analysed window")
     children = {str(name) for name in table[_CHILD].unique()} - {""}

@@ -78,7 +78,7 @@ def body_steps(
         warn(f"{_NOTHING}: no angles of {', '.join(unknown)}")
         return None
     try:
-        poses = head_poses(session, robot.links[0].name, span)
+        poses = head_poses(session, robot.links[0].name, span, beyond=1)
     except (DataError, LogError) as error:
         warn(f"{_NOTHING}: {error}")
         return None

@@ -61,6 +61,19 @@ def test_power_of_signals_sampled_at_other_times():
     assert power.dropped_nan == 1000 - power.count
 
 
+def test_a_factor_reaches_from_its_first_sample_to_its_last():
+    t = np.arange(10) * 10_000_000
+    current = Signal("q", "A", t, np.full(10, 2.0))
+    known = np.array([2, 3, 4, 6, 7]) * 10_000_000  # no gap: one of 20 ms
+    power = power_of(current, Signal("q", "V", known, known * 1e-6), 0)
+    np.testing.assert_allclose(power.t_s, np.arange(2, 8) * 0.01)
+    np.testing.assert_allclose(power.values, 2 * np.arange(20.0, 80.0, 10.0))
+    alone = power_of(current, Signal("q", "V", known[:1], known[:1] * 1e-6), 0)
+    assert (alone.count, alone.dropped_nan) == (0, 10)
+    two = power_of(current, Signal("q", "V", known[:2], known[:2] * 1e-6), 0)
+    np.testing.assert_allclose(two.values, [40.0, 60.0])
+
+
 def test_clean_sorts_drops_and_counts():
     t_ns = np.array([10, 30, 20, 20, 40]) * SECOND
     series = clean("q", t_ns, np.array([1.0, 3.0, 2.0, 9.0, np.inf]), 10 * SECOND)

@@ -170,24 +170,28 @@ class Tree:
         return outcome, took_s, " -> ".join(text.strip() for text in differing[0])
 
     def run(self, tests):
-        """Run tests in the copy; return ``passed``, ``failed`` or ``limit``, and the time [s]."""
-        words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
-        words += ["-m", "not slow and not clock", *(one.relative_to(ROOT) for one in tests)]
-        env = os.environ | {"PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
+        """Run fast tests in the copy; return the outcome, and the time [s]."""
+        names = [one.relative_to(ROOT) for one in tests]
         began = time.monotonic()
+        code = self.code_of("-m", "not slow and not clock", *names, limit_s=LIMIT_S)
+        outcome = {None: "limit", 0: "passed", 5: "passed"}.get(code, "failed")
+        return outcome, time.monotonic() - began
+
+    def code_of(self, *words, limit_s):
+        """Run pytest in the copy; return its exit code, None if it was ended at the limit."""
+        words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *words]
+        env = os.environ | {"PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
         with subprocess.Popen(
             list(map(str, words)), cwd=self.root, env=env, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         ) as process:  # fmt: skip
             try:
-                code = process.wait(LIMIT_S)
+                return process.wait(limit_s)
             except subprocess.TimeoutExpired:
-                code = None
+                return None
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
-        outcome = {None: "limit", 0: "passed", 5: "passed"}.get(code, "failed")
-        return outcome, time.monotonic() - began
 
 
 class Mutants:

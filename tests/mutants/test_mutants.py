@@ -2,7 +2,7 @@
 
 import pytest
 
-from mutants import run
+from mutants import delays, run
 from support.paths import ROOT
 
 CODE = """
@@ -63,3 +63,9 @@ def test_a_run_goes_on_and_counts_what_survived(tmp_path):
         "c -> d",
         "g -> h",
     ]
+
+
+@pytest.mark.parametrize("delay", delays.DELAYS, ids=lambda one: one.test.rpartition("::")[2])
+def test_there_is_a_place_for_each_delay(delay):
+    whole = (ROOT / delay.path).read_text()
+    assert delays.planted(whole, delay, 2 * delays.tolerance_of(delay.test)) != whole

@@ -106,14 +106,14 @@ def check_kill(command, folder, path, accepted):
 
 
 @pytest.mark.slow
-@pytest.mark.clock(0.02, "a recorder that is killed has what was accepted 50 ms before")
+@pytest.mark.clock(0.03, "a recorder that is killed has what was accepted 50 ms before")
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
 def test_a_killed_recording_has_what_was_accepted(options, tmp_path, command, cycle):
     check_kill(command, tmp_path, *record_and_kill(cycle, tmp_path, 0, *options))
 
 
 @pytest.mark.nightly
-@pytest.mark.clock(0.02, "a recorder that is killed has what was accepted 50 ms before")
+@pytest.mark.clock(0.03, "a recorder that is killed has what was accepted 50 ms before")
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
 def test_fifty_kills(options, tmp_path, command, cycle):
     rerun = Path(sys.executable).with_name("rerun")

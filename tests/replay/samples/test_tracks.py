@@ -34,6 +34,22 @@ def test_nan_that_fills_up_foreign_messages_is_left_out():
     np.testing.assert_array_equal(found.values, [0.0, 4.0])
 
 
+def test_half_of_the_samples_or_more_are_fillers():
+    half = track("a", T[:4], np.array([0.0, np.nan, 2.0, np.nan]))
+    np.testing.assert_array_equal(tracks.without_filler(half).t_ns, [0, 20])
+
+
+def test_quantities_of_a_joint_are_paired_in_the_order_of_the_first():
+    first, second = [track("c"), track("a"), track("x")], [track("a", T + 1), track("c", T + 2)]
+    assert tracks.pairs(first, second) == [(first[0], second[1]), (first[1], second[0])]
+
+
+def test_pieces_are_joined_one_after_another():
+    whole = tracks.one_after_another([track("a", T[:2]), track("a", T[2:], np.ones(3))])
+    assert (whole.name, whole.t_ns.tolist()) == ("a", T.tolist())
+    np.testing.assert_array_equal(whole.values, [0, 1, 1, 1, 1])
+
+
 def test_a_lost_sample_stays_a_hole():
     lossy = track("a", T, np.array([0.0, 1.0, np.nan, 3.0, 4.0]))
     assert tracks.without_filler(lossy) is lossy
@@ -79,6 +95,9 @@ def test_a_rate_keeps_at_most_that_many_samples_a_second():
     jittered = t + np.random.default_rng(1).integers(-2 * MS, 2 * MS, 1000)
     assert np.array_equal(tracks.decimate(jittered, 50.0) % 2, np.zeros(500))
     assert len(tracks.decimate(10 * t[:20], 50.0)) == 20
+    from_origin = tracks.decimate(t[:20] + 15 * MS, 50.0, origin_ns=0)  # slots from -5 ms on
+    np.testing.assert_array_equal(from_origin, np.arange(0, 20, 2))
+    np.testing.assert_array_equal(tracks.decimate(t[1:8], 50.0, origin_ns=0), [0, 1, 3, 5])
     assert tracks.decimate(ticks(), 50.0).size == 0
 
 
@@ -121,6 +140,10 @@ def test_a_command_is_held_until_the_next():
     at = ticks(-1, 0, 9, 10, 19, 69, 71)
     found = tracks.hold(ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), at)
     np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
+    table = tracks.hold(ticks(0, 10), np.array([[1.0, 2.0], [3.0, 4.0]]), ticks(-5, 5, 60, 61))
+    np.testing.assert_array_equal(table, [[NAN, NAN], [1.0, 2.0], [3.0, 4.0], [NAN, NAN]])
+    one = tracks.hold(ticks(5), np.array([1.0]), ticks(4, 5, 6))  # nobody knows for how long
+    np.testing.assert_array_equal(one, [NAN, 1.0, NAN])
 
 
 def test_without_samples_nothing_is_known():
@@ -140,6 +163,10 @@ def test_silence_before_the_end_is_a_gap():
     found = tracks.mark_gaps(t, values, end_ns=100 * MS)
     np.testing.assert_array_equal(found[0], ticks(0, 10, 20, 30))
     assert np.isnan(found[1][-1]).all()
+    same = tracks.mark_gaps(t, values, end_ns=70 * MS)  # five steps are none yet
+    assert same[0] is t
+    both = tracks.mark_gaps(ticks(0, 10, 20, 100), np.zeros((4, 1)), end_ns=200 * MS)
+    np.testing.assert_array_equal(both[0], ticks(0, 10, 20, 30, 100, 110))
     whole = tracks.mark_gaps(t, values, end_ns=40 * MS)
     assert all(one is given for one, given in zip(whole, (t, values), strict=True))
 
@@ -147,6 +174,10 @@ def test_silence_before_the_end_is_a_gap():
 def test_samples_out_of_order_are_sorted():
     t, values = tracks.ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
     np.testing.assert_array_equal(t, ticks(0, 10, 20))
+    np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
+    t = ticks(0, 10, 10, 20)
+    assert tracks.ordered(t, np.zeros(4))[0] is t
+    _, values = tracks.ordered(ticks(10, 10, 0), np.array([1.0, 2.0, 0.0]))
     np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
 
 

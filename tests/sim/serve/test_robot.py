@@ -182,7 +182,7 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, run
     live.command([0.1] * JOINTS)
     served = live.ended()
     assert served.complete
-    assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
+    assert -1_000_000 < served.start_ns - before - PERIOD_NS // 2 < 30_000_000
     resting, first = [], live.replies(JOINTS)
     while int(first["t_device_ns"][0]) < served.start_ns:
         resting.append(first)
