@@ -224,10 +224,8 @@ def test_a_long_session_is_looked_into_here_and_there(opened):
     start = session.start_ns
     assert looks[0] == (start, start + STRETCH_NS)
     assert [stop - low for low, stop in looks[1:]] == [2 * NS] * (len(looks) - 1)
-    every = 4 * STRETCH_NS
-    assert [low - start for low, _ in looks[1:]] == [
-        every * k for k in range(1, 6)
-    ]  # to 20 s before the end
+    every = 4 * STRETCH_NS  # the last one begins 20 s before the end at the latest
+    assert [low - start for low, _ in looks[1:]] == [every * k for k in range(1, 6)]
     brief = quantities.survey(session, 50.0, brief=True)
     assert not brief.is_whole
     seen_s = (brief.samples["/joints/measured"][0].t_ns - start) / NS
