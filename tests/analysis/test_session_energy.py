@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from support.frozen_records import mutable_dataclasses
 from support.twin_chains import chain
 from support.written_sessions import EPOCH_NS
 from undulog.analysis import energy
@@ -329,3 +330,7 @@ def test_a_robot_that_goes_nowhere_has_no_cost(written, robot, monkeypatch):
     assert cost.why.startswith("the centre of mass moves by 410 mm in 4 cycles")
     assert cost.distance_m.value == pytest.approx(0.41)
     assert [str(text) for text in said] == [f"cost of transport is not applicable: {cost.why}"]
+
+
+def test_what_is_handed_on_can_not_be_changed():
+    assert mutable_dataclasses("undulog.analysis.energy") == set()

@@ -4,6 +4,7 @@ import group_tables
 import numpy as np
 import pytest
 
+from support.frozen_records import mutable_dataclasses
 from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
@@ -239,3 +240,7 @@ def test_the_shared_frequencies_have_intervals_that_hold():
             half = t_factor(group.omega_dof) * group.omega_error
             inside.append(abs(group.fit.omega - true) <= half)
     assert np.mean(inside) > 0.87  # 80 draws: standard error 2.4 %
+
+
+def test_what_is_handed_on_can_not_be_changed():
+    assert mutable_dataclasses("undulog.analysis.response") == set()

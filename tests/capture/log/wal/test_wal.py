@@ -7,6 +7,7 @@ import zlib
 import pytest
 from mcap.records import Attachment, Header, Metadata, Schema
 
+from support.frozen_records import mutable_dataclasses
 from support.processes import wait_for
 from support.wal_messages import CHANNEL, check_messages, filled, message
 from undulog.capture.common import errors
@@ -157,3 +158,7 @@ def test_what_is_no_log_is_refused(tmp_path):
         recover(tmp_path / "none")
     with pytest.raises(errors.NotALogError, match="no segment"):
         recover(tmp_path)
+
+
+def test_what_is_handed_on_can_not_be_changed():
+    assert mutable_dataclasses("undulog.capture.log.wal") == {"_Mapping"}

@@ -1,0 +1,25 @@
+"""Dataclasses of a package that can be changed after they were made."""
+
+import dataclasses
+import importlib
+import pkgutil
+
+
+def mutable_dataclasses(package):
+    """Return the names of a package's dataclasses that aren't frozen.
+
+    Args:
+        package: Its dotted name, or that of a module.
+    """
+    root = importlib.import_module(package)
+    found = pkgutil.walk_packages(getattr(root, "__path__", []), f"{package}.")
+    modules = [root, *(importlib.import_module(one.name) for one in found)]
+    return {
+        name
+        for module in modules
+        for name, one in vars(module).items()
+        if isinstance(one, type)
+        and dataclasses.is_dataclass(one)
+        and one.__module__ == module.__name__
+        and not one.__dataclass_params__.frozen
+    }
