@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-import time
+from collections import deque
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from support import golden_pictures, processes
-from support.processes import freeze
+from support.processes import freeze, wait_for
 from undulog.replay.viewer import Viewer, client_of
 
 pytestmark = pytest.mark.slow
@@ -175,19 +175,28 @@ def test_a_viewer_that_is_killed_is_reported(shown):
     assert shown.finish() == (1, "", "error: the Rerun viewer was ended by signal 9\n")
 
 
-@pytest.mark.clock(0.5, "memory is watched for as long as a frozen viewer's socket takes to fill")
+def processor_ticks(pid):
+    """Processor time of a process so far [clock ticks]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])
+
+
 def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(shown):
-    viewer = viewer_of(shown)
+    viewer, pid = viewer_of(shown), shown.process.pid
     freeze(viewer)
+    looks = deque(maxlen=30)
 
     def megabytes():
-        pages = Path(f"/proc/{shown.process.pid}/statm").read_text().split()[1]
+        pages = Path(f"/proc/{pid}/statm").read_text().split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
-    time.sleep(5.0)  # by now it waits, or has sent what the socket holds
+    def waits():  # for the viewer: it looks whether it is still wanted, and does nothing else
+        looks.append(processor_ticks(pid))
+        return len(looks) == looks.maxlen and looks[-1] - looks[0] <= 3
+
     before = megabytes()
-    time.sleep(5.0)
-    assert megabytes() < before + 20.0
+    wait_for(waits, "a viewer that takes nothing", alive=[shown.process], pause_s=0.1)
+    assert megabytes() < before + 50.0  # of some hundred that are still to be sent
     shown.process.send_signal(signal.SIGTERM)
     assert shown.finish() == (0, "", "")
     assert not Path(f"/proc/{viewer}").exists()
