@@ -313,7 +313,7 @@ class HarmonicFit:
     def explained(self) -> FloatArray:
         """Share of each channel's variance that the model explains, shape (K,); 0 if constant."""
         ratio = np.divide(self.rss, self.total, out=np.ones_like(self.rss), where=self.total > 0)
-        return np.clip(1 - ratio, 0.0, 1.0)
+        return np.maximum(1 - ratio, 0.0)
 
     def parameters(self, channels: Sequence[int] | IntArray, scale: float) -> FloatArray:
         """Coefficients of the basis rows of some channels.

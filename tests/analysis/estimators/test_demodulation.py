@@ -5,7 +5,12 @@ import pytest
 from scipy.signal import lfilter
 
 from support.written_topics import write_topics
-from undulog.analysis.estimators.demodulation import Phase, cycles_of, demodulate
+from undulog.analysis.estimators.demodulation import (
+    Phase,
+    _difference_dof,
+    cycles_of,
+    demodulate,
+)
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.session.cycles import response_over_time
@@ -149,3 +154,64 @@ def test_a_phase_may_be_logged_within_a_turn(tmp_path):
         assert one.start_s == pytest.approx(other.start_s, abs=1e-9)
         assert one.gain == pytest.approx(other.gain, rel=1e-9)
         assert one.lag_rad == pytest.approx(other.lag_rad, abs=1e-9)
+
+
+# -- the noise of a cycle, by second differences --------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [2, 3, 10, 200])
+def test_second_differences_have_the_degrees_of_freedom_of_their_covariance(count):
+    differences = np.zeros((count, count + 2))
+    for k in range(count):
+        differences[k, k : k + 3] = 1.0, -2.0, 1.0
+    covariance = differences @ differences.T
+    # Of a sum of squares (Satterthwaite), of two parts each.
+    dof = 2 * np.trace(covariance) ** 2 / np.trace(covariance @ covariance)
+    assert _difference_dof(count) == pytest.approx(dof)
+
+
+def test_the_noise_of_a_cycle_is_that_of_its_second_differences():
+    rng = np.random.default_rng(8)
+    edges = [np.arange(42.0), np.arange(100.0, 131.0)]
+    asked = [0.5 + 0.1 * np.cos(np.arange(one.size - 1)) + 0j for one in edges]
+    truth = [0.8 * np.exp(-0.3j + 0.01j * np.arange(one.size)) for one in asked]
+    sigma = 0.002
+    given = [
+        h * c + sigma * (rng.normal(size=c.size) + 1j * rng.normal(size=c.size))
+        for h, c in zip(truth, asked, strict=True)
+    ]
+    found = cycles_of(edges, asked, given)
+    np.testing.assert_allclose(found.ratio, np.concatenate(given) / np.concatenate(asked))
+    expected = sigma**2 / np.abs(np.concatenate(given)) ** 2
+    np.testing.assert_allclose(found.variance, expected, rtol=0.5)
+    assert found.variance[3] / found.variance[5] == pytest.approx(expected[3] / expected[5])
+    by_hand = []
+    for h, c in zip(given, asked, strict=True):
+        ratio, share = h / c, 1 / np.abs(c) ** 2
+        for k in range(1, c.size - 1):
+            second = abs(ratio[k - 1] - 2 * ratio[k] + ratio[k + 1]) ** 2
+            by_hand.append(second / (share[k - 1] + 4 * share[k] + share[k + 1]))
+    power = np.abs(np.concatenate(given)) ** 2
+    np.testing.assert_allclose(found.variance, np.mean(by_hand) / 2 / power)
+    assert found.dof == pytest.approx(_difference_dof(len(by_hand)))
+    np.testing.assert_array_equal(found.start_s, np.r_[np.arange(41.0), np.arange(100.0, 130.0)])
+    np.testing.assert_array_equal(found.stop_s, found.start_s + 1.0)
+    late = cycles_of(edges, asked, given, settled_s=50.0)
+    np.testing.assert_allclose(late.variance, np.mean(by_hand[39:]) / 2 / power)
+    # Too few are left: all count.
+    np.testing.assert_allclose(
+        cycles_of(edges, asked, given, settled_s=128.0).variance, found.variance
+    )
+
+
+def test_whole_cycles_have_half_of_one_around_them():
+    t = np.arange(1001) / 100
+    phase = Phase(t, 0.3 + 2 * np.pi * 1.05 * t)
+    edges = phase.edges_s()
+    # 10.5 turns: nine whole cycles, and half of one at either end.
+    np.testing.assert_allclose(edges, (np.pi + 2 * np.pi * np.arange(10)) / (2 * np.pi * 1.05))
+    assert Phase(t[:100], 2 * np.pi * t[:100]).edges_s().size == 0
+    assert Phase(t[:2], np.array([0.0, 1e9])).edges_s().size == 0
+    np.testing.assert_allclose(
+        phase.at(np.array([-1.0, 0.005, 11.0])), [np.nan, 0.3 + phase.value[1] / 2 - 0.15, np.nan]
+    )
