@@ -5,7 +5,7 @@ import os
 import socket
 import time
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -76,11 +76,11 @@ def greet(client, listening=b"< hi >"):
 
 def sockets_of(pid):
     """Return the open sockets of a process."""
-    return [
-        link
-        for one in Path(f"/proc/{pid}/fd").iterdir()
-        if (link := os.readlink(one)).startswith("socket:")  # noqa: PTH115
-    ]
+    found = []
+    for one in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # closed since it was listed
+            found.append(os.readlink(one))  # noqa: PTH115
+    return [link for link in found if link.startswith("socket:")]
 
 
 def status_of(output):

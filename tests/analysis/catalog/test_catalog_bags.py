@@ -98,7 +98,7 @@ def test_a_bag_alone_and_damaged_ones(bags, opened):
     assert all("reindex" in reason for reason in reasons)
 
 
-@pytest.mark.parametrize("rounds", [1, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rounds", [1, pytest.param(15, marks=pytest.mark.nightly)])
 def test_mutated_bags_are_rows_or_damaged_ones(rounds, bags):
     draw = np.random.default_rng(4)
     paths = [path for path in bags.rglob("*") if path.is_file() and "tool" not in path.parts]
