@@ -91,12 +91,12 @@ PARTS = {
     "line_recorder": Part(line_recorder.run, 20, 1),
     "texts": Part(texts.run, 250, 8),
     "tables": Part(partial(mutated, part="tables"), 1_500, 10),
-    "arrays": Part(partial(mutated, part="arrays"), 1_500, 10),
-    "datasets": Part(partial(mutated, part="datasets"), 1_000, 10),
-    "bags": Part(partial(mutated, part="bags"), 1_500, 10),
-    "binary": Part(partial(mutated, part="binary"), 4_500, 10),
-    "serial": Part(partial(mutated, part="serial"), 2_000, 10),
-    "mutated": Part(mutated, 34_894, 60),
+    "arrays": Part(partial(mutated, part="arrays"), 600, 10),
+    "datasets": Part(partial(mutated, part="datasets"), 500, 10),
+    "bags": Part(partial(mutated, part="bags"), 500, 10),
+    "binary": Part(partial(mutated, part="binary"), 1_000, 10),
+    "serial": Part(partial(mutated, part="serial"), 1_000, 10),
+    "mutated": Part(mutated, 41_794, 60),
 }
 LONG = sum(part.long for part in PARTS.values())
 
