@@ -1,0 +1,158 @@
+"""What a drive over a bus says of itself: for people, for JSON, for the session."""
+
+import dataclasses
+import itertools
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from support.twin_chains import chain
+from undulog.capture import load_robot
+from undulog.capture.sources.contract import parse_address
+from undulog.sim.drive.limits import gate_limits
+from undulog.sim.drive.loop import LoopTally
+from undulog.sim.drive.outcome import (
+    MUTE,
+    DriveEnding,
+    FaultKind,
+    GateEvent,
+    GateFault,
+    Outcome,
+    jitter,
+)
+from undulog.sim.drive.report import BusPlan, BusReport, Feedback
+
+COMPLETE = Outcome(DriveEnding.COMPLETE, "", "the joints are straight")
+FAULT = GateFault(FaultKind.CURRENT, "joint01: current 3 A", "joint01", 3.0, 1.4, 2.5)
+STOPPED = Outcome(DriveEnding.FAULT, "joint01: current 3 A", "the joints were held", FAULT)
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "chain.toml"
+    safety = {"max_rate": 4.0, "ramp_rate": 1.0, "max_tracking_error": 0.3, "max_current": 1.4}
+    safety |= {"max_temperature": 70.0, "reply_timeout_s": 1.0, "max_late_s": 1.5}
+    text = chain(3) + "[safety]\n" + "".join(f"{key} = {one}\n" for key, one in safety.items())
+    path.write_text(text + 'fault_after_s = 0.5\non_fault = "hold"\n')
+    robot = load_robot(path)
+    driven = SimpleNamespace(name="wave.mcap", kind="commands")
+    address = parse_address("can:socketcand:can0?port=28600")
+    return BusPlan(driven, robot, gate_limits(robot), address, 5.0, Path("out.mcap"))
+
+
+@pytest.fixture
+def report(plan):
+    tally = LoopTally(loop_s=6.5, sent=1500, received=4000, decoded=3900)
+    return BusReport(plan, COMPLETE, tally, False, 1.25, 5.0, 500, {}, None, wall_s=13.0)
+
+
+def test_a_complete_drive_in_lines(report):
+    assert report.complete
+    assert report.remarks() == []
+    assert report.lines() == [
+        "can:socketcand:can0?port=28600: drove wave.mcap for 5 s",
+        "commands for chain3, 500 ticks in real time, begun after 1.25 s; the joints are straight",
+        "1500 frames sent, 4000 received, 3900 of them with readings",
+        "session: out.mcap",
+    ]
+
+
+def test_one_that_was_stopped_says_where_and_why(report, plan):
+    report.outcome, report.gait_s, report.lockstep, report.approach_s = STOPPED, 2.5, True, None
+    report.plan = dataclasses.replace(plan, recorder=Path("/run/r.sock"))
+    report.taken, report.not_taken = 200, "it is gone"
+    assert not report.complete
+    assert report.lines() == [
+        "can:socketcand:can0?port=28600: stopped at 2.5 s of 5 s: joint01: current 3 A",
+        "commands for chain3, 500 ticks in lockstep with the robot; the joints were held",
+        "1500 frames sent, 4000 received, 3900 of them with readings",
+        "session: out.mcap",
+        "the recorder at /run/r.sock received 200 samples of the gait",
+        "warning: it did not receive all: it is gone",
+    ]
+
+
+def test_what_was_not_as_it_should_be_is_remarked(report):
+    report.jitter = jitter([0.001, 0.002, 0.003])
+    report.tally.overruns, report.malformed, report.dropped = 2, 3, 4
+    report.waits, report.longest_wait_s = 5, 0.00125
+    report.cuts = {"position": 0, "over_rate": 6, "yields": 7}
+    assert report.remarks() == [
+        GateEvent("info", "ticks were late by 2.00 ms (median), 2.98 ms (99 %), 3.00 ms at worst"),
+        GateEvent("warn", "2 control ticks were left out, as the one before took too long"),
+        GateEvent("warn", "messages of the bus that could not be read: 3"),
+        GateEvent("warn", "messages of the bus that were dropped: 4"),
+        GateEvent(
+            "info",
+            "commands that followed a late one and waited: 5, up to 1.25 ms, so that no command "
+            "was too fast",
+        ),
+        GateEvent("warn", "the gate changed commands of single joints: 6 over rate, 7 yields"),
+    ]
+    lines = report.lines()
+    assert lines[3].startswith("ticks were late by")
+    assert lines[4] == f"warning: {report.remarks()[1].text}"
+    report.tally.overruns = 1
+    assert report.remarks()[1].text.startswith("1 control tick was left out")
+
+
+def test_facts_are_plain_values_with_units_in_their_names(report, plan):
+    found = report.facts()
+    assert found["real_time_factor"] == 0.5
+    assert (found["pace"], found["armed"], found["recorder"]) == ("real time", True, None)
+    assert (found["outcome"], found["why"], found["fault"]) == ("complete", None, None)
+    assert (found["duration_s"], found["planned_duration_s"], found["whole_s"]) == (5.0, 5.0, 6.5)
+    assert (found["sent"], found["received"], found["decoded"]) == (1500, 4000, 3900)
+    assert (found["feedback"], found["lateness"], found["gait_not_told"]) == (None, None, None)
+    assert (found["driven"], found["kind"], found["robot"]) == ("wave.mcap", "commands", "chain3")
+    report.outcome, report.lockstep = STOPPED, True
+    report.plan = dataclasses.replace(plan, recorder=Path("r.sock"))
+    report.feedback = Feedback(False, 0.02, 6, 0.01)
+    report.jitter, report.wall_s = jitter([0.0]), 0.0
+    found = report.facts()
+    assert (found["pace"], found["recorder"]) == ("lockstep", "r.sock")
+    assert found["fault"] == {
+        "kind": "current", "joint": "joint01", "value": 3.0, "limit": 1.4, "since_s": 2.5,
+    }  # fmt: skip
+    assert found["feedback"]["most_steps"] == 7
+    assert found["lateness"]["ticks"] == 1
+    assert found["real_time_factor"] == pytest.approx(6500.0)  # of no time at all
+
+
+def test_how_many_steps_may_be_on_their_way():
+    asked, unasked = Feedback(True, 0.01, 3, 0.01), Feedback(False, 0.01, 3, 0.01)
+    assert (asked.most_steps, unasked.most_steps) == (1, 4)
+    assert asked.facts() == {
+        "confirmed_by": "replies",
+        "reply_interval_s": "0.01",
+        "hold_after_ticks": "3",
+        "hold_after_s": "0.03",
+        "most_steps": "1",
+    }
+    assert unasked.facts()["confirmed_by"] == "nothing"
+
+
+def test_lateness_by_numpy():
+    assert jitter([]) is None
+    late_s = np.array([0.0, 1e-4, 1.1e-4, 2e-3, 0.02, 0.0201, 0.1, 0.2, 9.0])
+    found = jitter(late_s.tolist())
+    assert (found.ticks, found.worst_s) == (9, 9.0)
+    assert found.median_s == np.median(late_s)
+    assert found.p99_s == np.quantile(late_s, 0.99)
+    edges = np.array([0, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, np.inf]) * 1e-3
+    inside = [
+        int(np.sum((late_s <= high) & ((late_s > low) | ((low == 0) & (late_s == 0)))))
+        for low, high in itertools.pairwise(edges)
+    ]
+    assert list(found.counts) == inside
+    assert list(found.to_dict()["counts"])[::10] == ["<= 0.1 ms", "> 100 ms"]
+
+
+def test_faults_for_json():
+    assert FAULT.to_dict() == {
+        "kind": "current", "joint": "joint01", "value": 3.0, "limit": 1.4,
+    }  # fmt: skip
+    assert GateFault(FaultKind.BUS, "gone").to_dict()["joint"] is None
+    assert {FaultKind.BUS_OFF, FaultKind.BUS, FaultKind.STRANGER} == MUTE
