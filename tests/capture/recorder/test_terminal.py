@@ -111,6 +111,39 @@ def test_the_answer_comes_first_and_everything_is_on_the_screen():
     assert lines[-1] == "0:12:22 error imu: the connection is lost"
 
 
+def test_what_is_not_known_is_a_dash_and_what_is_to_come_dots():
+    new = SourceSnapshot("new", "unix:/x", connected=True, frames=None)
+    clockless = replace(CAN, name="plain", clock=replace(CLOCK, own_clock=False), load=None)
+    soon = replace(CAN, name="soon", clock=replace(CLOCK, drift_ppm=None), rate_hz=99.94)
+    lines = rows(replace(SNAPSHOT, sources=(new, clockless, soon), topics=()), 120)
+    assert row(lines, "new") == ["new", "connected", "-", "-", "0", "-", "-", "-", "-", "0", "0"]
+    assert row(lines, "plain")[5:8] == ["-", "-", "-"]
+    assert row(lines, "soon")[2] == "99.9"
+    assert row(lines, "soon")[6:8] == ["...", "2.14"]
+    fresh = TopicSnapshot("/imu", 5, None, 0.25, jitter=0.0)
+    lines = rows(replace(SNAPSHOT, sources=(), topics=(fresh,)), 120)
+    assert row(lines, "/imu") == ["/imu", "...", "0.2", "-", "-", "0%", "-", "5", "-"]
+
+
+def test_events_have_their_time_since_the_start():
+    early = EventLine(EPOCH_NS - 900 * NS, "warn", "a", "long before")
+    later = EventLine(SNAPSHOT.now_ns + 5 * NS, "fatal", "b", "still to come")
+    lines = rows(replace(SNAPSHOT, events=(early, later)), 100)
+    assert lines[-2:] == ["0:00:00 warn a: long before", "0:12:34 fatal b: still to come"]
+
+
+def test_the_headline_leaves_out_what_there_is_not():
+    bare = replace(SNAPSHOT, robot=None, part=None, free=None, byte_rate=None, reasons=("one",))
+    lines = rows(replace(bare, tick_p99_s=None, backlog=7), 100)
+    assert lines[0].split() == ["recording", "/data/run.mcap", "0:12:34"]
+    assert lines[1] == "123 MB | 1,234,567 messages"
+    assert lines[2].startswith(" DEGRADED  so far, 1 reason | 7 frames to decode")
+    assert lines[3].startswith("  one")
+    assert "tick" not in lines[2]
+    assert " reasons | tick p99 2.1 ms" in rows(SNAPSHOT, 100)[2]
+    assert plain_line(bare).endswith("imu not connected; one")
+
+
 def test_a_good_recording_says_so_in_words():
     good = replace(SNAPSHOT, verdict="good", reasons=(), events=(), topics=(), sources=())
     assert "GOOD" in rows(good, 80)[2]
@@ -149,10 +182,16 @@ def test_a_small_screen_counts_the_topics_that_it_leaves_out():
     ("time_s", "clock", "left"),
     [
         (0.4, "0:00:00", "0 s"),
-        (59.0, "0:00:59", "59 s"),
+        (59.9, "0:00:59", "59 s"),
+        (60.0, "0:01:00", "1 min"),
         (3599.0, "0:59:59", "59 min"),
+        (3600.0, "1:00:00", "1 h 0 min"),
         (12_000.0, "3:20:00", "3 h 20 min"),
+        (35_999.0, "9:59:59", "9 h 59 min"),
+        (36_000.0, "10:00:00", "10 h"),
         (100_000.0, "27:46:40", "27 h"),
+        (172_799.0, "47:59:59", "47 h"),
+        (172_800.0, "48:00:00", "2 d"),
         (400_000.0, "111:06:40", "4 d"),
     ],
 )
