@@ -138,7 +138,8 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
     )
     known: BoolArray = filled >= _LEAST_SAMPLES
     result = np.full(right.shape[1:], np.nan, dtype=np.complex128)
-    each = right[..., known].reshape(3, -1, np.count_nonzero(known))
+    channels = int(np.prod(right.shape[1:-1]))
+    each = right[..., known].reshape(3, channels, np.count_nonzero(known))
     solved = np.linalg.solve(gram.T[known], each.transpose(2, 0, 1))
     result[..., known] = (solved[:, 1] + 1j * solved[:, 2]).T.reshape(result[..., known].shape)
     return result

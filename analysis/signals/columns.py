@@ -13,7 +13,7 @@ from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.find import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
-from undulog.capture.log.read.sample_times import JointSignals, Signal
+from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
 from ..response.rhythm import DRIVEN_SHARE
@@ -68,11 +68,11 @@ class Columns:
 
     def commanded(self) -> tuple[str, ...]:
         """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest."""
-        swing = {
-            name: float(np.nanmax(signal.values) - np.nanmin(signal.values))
-            for name, signal in self.command.items()
-            if np.isfinite(signal.values).any()
-        }
+        swing: dict[str, float] = {}
+        for name, signal in self.command.items():
+            usable = signal.values[np.abs(signal.values) <= LARGEST]
+            if usable.size:
+                swing[name] = float(np.ptp(usable))
         least = DRIVEN_SHARE * max(swing.values(), default=0.0)
         return tuple(name for name in self.names if swing.get(name, 0.0) > least)
 

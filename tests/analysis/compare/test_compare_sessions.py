@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from undulog.analysis import Choices, Options, compare_sessions
-from undulog.capture import Session
+from undulog.analysis.signals.columns import read_columns
+from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 
-SIGMA = 0.003
+SIGMA, EPOCH_NS = 0.003, 1_700_000_000_000_000_000
 
 
 @pytest.fixture
@@ -201,3 +202,39 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
 )
 def test_wrong_usage_exits_2(words, message, command):
     assert message in command("compare", *words, code=2).err
+
+
+@pytest.fixture
+def sparse(tmp_path):
+    """Writes three joints at 1 Hz, sampled 4.8 times a cycle; the third has its own gain."""
+
+    def make(name, gain, *, largest=0.0):
+        path, names = tmp_path / f"{name}.mcap", ["a", "b", "c"]
+        rng = np.random.default_rng(len(name))
+        with SessionWriter(path, session_id=name, epoch_ns=EPOCH_NS) as writer:
+            commands = writer.joint_state("/joint_commands", names, unit="rad")
+            states = writer.joint_state("/joint_states", names, unit="rad")
+            for k in range(300):
+                t_ns = k * 210_000_000
+                phase = 2 * np.pi * t_ns * 1e-9 + np.arange(3)
+                command = 0.4 * np.sin(phase)
+                if k in (100, 101):
+                    command[0] += largest * (-1) ** k
+                commands.write(EPOCH_NS + t_ns, command)
+                answer = np.array([0.95, 0.95, gain]) * 0.4 * np.sin(phase - 0.2)
+                states.write(EPOCH_NS + t_ns, answer + rng.normal(0, 1e-3, 3))
+        return path
+
+    return make
+
+
+def test_cycles_of_few_samples_are_compared_by_the_whole(sparse):
+    result = compared(sparse("first", 0.95), sparse("other", 0.8))
+    assert result.verdict == "different"
+    assert result.answer.startswith("B differs from A: c most, gain −15.")  # 0.8 of 0.95
+
+
+def test_values_beyond_any_unit_are_left_out(sparse):
+    with Session.open(sparse("huge", 0.95, largest=1.7e308)) as session:
+        columns = read_columns(session, "/joint_commands", "/joint_states", print)
+    assert columns.commanded() == ("a", "b", "c")

@@ -1,5 +1,7 @@
 """Gain and lag over time against planted truth: slow changes, a frequency that changes, noise."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -8,6 +10,7 @@ from support.written_topics import write_topics
 from undulog.analysis.estimators.demodulation import (
     Phase,
     _difference_dof,
+    amplitudes,
     cycles_of,
     demodulate,
 )
@@ -215,3 +218,23 @@ def test_whole_cycles_have_half_of_one_around_them():
     np.testing.assert_allclose(
         phase.at(np.array([-1.0, 0.005, 11.0])), [np.nan, 0.3 + phase.value[1] / 2 - 0.15, np.nan]
     )
+
+
+def test_the_amplitude_of_a_cycle_is_that_of_its_own_samples():
+    rng = np.random.default_rng(9)
+    t, omega = np.sort(rng.uniform(0.0, 4.0, 60)), 2 * np.pi
+    starts = np.searchsorted(t, [0.0, 1.0, 1.2, 2.0, 4.0])
+    values = rng.normal(size=(2, 3, t.size))
+    found = amplitudes(t, values, starts, omega)
+    assert found.shape == (2, 3, 4)
+    for k, (i, j) in enumerate(itertools.pairwise(starts.tolist())):
+        if j - i < 6:
+            assert np.isnan(found[..., k]).all()
+            continue
+        rows = np.stack([np.ones(j - i), np.cos(omega * t[i:j]), -np.sin(omega * t[i:j])], axis=1)
+        best = np.linalg.lstsq(rows, values[..., i:j].reshape(6, -1).T, rcond=None)[0]
+        np.testing.assert_allclose(found[..., k].ravel(), best[1] + 1j * best[2], atol=1e-9)
+    few = amplitudes(t, values, np.array([0, 3, 5]), omega)
+    assert few.shape == (2, 3, 2)
+    assert np.isnan(few).all()
+    assert amplitudes(t, values, np.array([4]), omega).shape == (2, 3, 0)
