@@ -45,6 +45,7 @@ class Part:
 PARTS = {
     "slow": Part("make slow", "the slow tests of what is promised"),
     "clock": Part("make clock", "the tests of real time"),
+    "delays": Part("make delays", "delays planted in the product, for the tests of real time"),
     "night": Part("make night", "levels of intervals, long runs of the twin, pictures, studies"),
     "campaign": Part(
         "PYTHONPATH=tests:bench:. .venv/bin/python -m campaign.run -o out/nightly/COMMIT/campaign",

@@ -65,4 +65,4 @@ def test_an_interrupt_ends_the_part_and_leaves_the_table(tmp_path):
 
 def test_a_part_that_there_is_not_is_named():
     done = run(sys.executable, ".ci/nightly.py", "zo", cwd=ROOT, code=2)
-    assert "no part zo; there are slow, clock, night" in done.stderr
+    assert "no part zo; there are slow, clock, delays, night" in done.stderr
