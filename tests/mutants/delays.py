@@ -72,8 +72,8 @@ DELAYS = [
         f"{RECORDER}/test_source_clock.py"
         "::test_another_process_with_another_clock_over_a_real_socket",
         "capture/recorder/source_clock.py",
-        "        return mapped\n",
-        "        return mapped + {ns}\n",
+        "            self._count_delays()\n        return mapped\n",
+        "            self._count_delays()\n        return mapped + {ns}\n",
     ),
     Delay(
         "tests/capture/exchange/test_can_fd.py::test_a_recording_keeps_and_decodes_both_kinds",
