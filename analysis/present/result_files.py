@@ -121,6 +121,8 @@ def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a 
         return None
     if origin in (Union, types.UnionType):
         return _build(next(one for one in arguments if one is not type(None)), value)
+    if origin in (tuple, dict) or dataclasses.is_dataclass(kind):
+        _require(list if origin is tuple else dict, kind, value)
     if origin is tuple:
         if arguments[-1] is Ellipsis:
             return tuple(_build(arguments[0], one) for one in value)
@@ -128,6 +130,11 @@ def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a 
     if origin is dict:
         return {key: _build(arguments[1], one) for key, one in value.items()}
     return _dataclass(kind, value) if dataclasses.is_dataclass(kind) else _plain(kind, value)
+
+
+def _require(container: type, kind: Any, value: object) -> None:
+    if not isinstance(value, container):
+        raise TypeError(f"{value!r:.40} where {kind} is expected")
 
 
 def _plain(kind: type[Any], value: Any) -> Any:
