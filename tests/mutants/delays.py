@@ -78,8 +78,8 @@ DELAYS = [
     Delay(
         "tests/capture/exchange/test_can_fd.py::test_a_recording_keeps_and_decodes_both_kinds",
         "capture/sources/can.py",
-        "    host = np.array([t_ns for t_ns, _ in messages], dtype=np.uint64)\n",
-        "    host = np.array([t_ns + {ns} * fd for t_ns, _ in messages], dtype=np.uint64)\n",
+        "[given] = micros * np.uint64(1000)\n",
+        "[given] = micros * np.uint64(1000) + np.uint64({ns} * fd)\n",
     ),
     Delay(
         "tests/sim/serve/test_feetech.py"
