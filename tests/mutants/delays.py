@@ -143,9 +143,9 @@ def main():
             path.write_text(whole)
             counts = {one: outcomes.count(one) for one in ("failed", "passed", "not judged")}
             missed += counts["failed"] < options.count
-            told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
+            listed = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
             function = delay.test.rpartition("::")[2]
-            print(f"{function}: {delay_s:g} s in {delay.path}: {told}", flush=True)
+            print(f"{function}: {delay_s:g} s in {delay.path}: {listed}", flush=True)
     return int(missed > 0)
 
 

@@ -296,7 +296,7 @@ def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
 
 @pytest.mark.slow
 def test_a_robot_that_comes_late_is_not_the_controllers_fault(driving):
-    """The listener tells these tests whether a bus was silent by itself."""
+    """By the listener these tests know whether a bus was silent by itself."""
     with driving() as drive:
         drive.begun()
         drive.stage.robot.send_signal(signal.SIGSTOP)

@@ -196,10 +196,13 @@ def test_texts_and_events(tmp_path):
             events.write(EPOCH_NS, level, "twin", level * 2)
         with pytest.raises(DataError, match="level 'loud' is none of debug, info, warn"):
             events.write(EPOCH_NS, "loud", "twin", "")
-    *told, mode = (content for *_, content in decoded_of(path))  # the text was recorded later
+    *events_read, mode = (
+        content for *_, content in decoded_of(path)
+    )  # the text was recorded later
     assert mode.data == "wälk"
-    assert [one.level for one in told] == [10, 20, 30, 40, 50]  # rcl_interfaces/msg/Log
-    assert (told[2].name, told[2].msg, told[2].stamp.nanosec) == ("twin", "warnwarn", 123_456_789)
+    assert [one.level for one in events_read] == [10, 20, 30, 40, 50]  # rcl_interfaces/msg/Log
+    third = events_read[2]
+    assert (third.name, third.msg, third.stamp.nanosec) == ("twin", "warnwarn", 123_456_789)
     *_, (*_, last) = messages_of(path)
     assert (last.log_time, last.publish_time) == (LOGGED_NS, EPOCH_NS)
 
@@ -213,8 +216,8 @@ def test_diagnostics(tmp_path):
         tmp_path / "x.mcap", lambda writer: writer.diagnostics(), ((statuses,), {})
     )
     assert stamp_ns(found.header) == EPOCH_NS
-    told = [(one.level, one.name, one.message, one.hardware_id) for one in found.status]
-    assert told == [(0, "source a", "fine", ""), (2, "disk", "full", "/dev/x")]
+    listed = [(one.level, one.name, one.message, one.hardware_id) for one in found.status]
+    assert listed == [(0, "source a", "fine", ""), (2, "disk", "full", "/dev/x")]
     assert [(one.key, one.value) for one in found.status[1].values] == [
         ("free", "0"),
         ("left", "3"),
