@@ -94,9 +94,9 @@ PARTS = {
     "arrays": Part(partial(mutated, part="arrays"), 600, 10),
     "datasets": Part(partial(mutated, part="datasets"), 500, 10),
     "bags": Part(partial(mutated, part="bags"), 500, 10),
-    "binary": Part(partial(mutated, part="binary"), 1_000, 10),
+    "binary": Part(partial(mutated, part="binary"), 4_500, 10),
     "serial": Part(partial(mutated, part="serial"), 1_000, 10),
-    "mutated": Part(mutated, 41_794, 60),
+    "mutated": Part(mutated, 38_294, 60),
 }
 LONG = sum(part.long for part in PARTS.values())
 
