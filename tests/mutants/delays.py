@@ -3,8 +3,8 @@
 A delay of twice a test's tolerance is planted where the test would feel it; the test has to fail
 each time. For a computer that does nothing else: a test that isn't judged has not failed.
 
-``test_gate_stall.py`` isn't among them: that commands stay within their bound holds however late
-the product is, and where it doesn't, a slower step is what it plants itself.
+``test_gate_stall.py`` isn't among them: commands stay within their bound however late the product
+is, and the stalls and delays of those tests are their own inputs.
 """
 
 import argparse
