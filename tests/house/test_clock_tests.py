@@ -2,13 +2,14 @@
 
 import ast
 import re
+import subprocess
 import sys
 
 import pytest
 
 from support.paths import ROOT
 from support.processes import run
-from support.witness import WINDOW_S, Lateness
+from support.witness import WINDOW_S, Lateness, of_others
 
 TESTS = """
 import time
@@ -97,6 +98,57 @@ def test_lateness_is_what_was_waited_within_a_second(wait_s):
         late.add(number * 0.25, wait_s)
     assert late.longest_s == pytest.approx(0.5 if wait_s == 0.1 else 0.0)
     assert WINDOW_S == 1.0
+
+
+@pytest.mark.parametrize(
+    ("tested_s", "others_s", "lateness_s"),
+    [
+        (0.0, 0.0, 0.1),  # a timer, or the virtual machine's host
+        (0.1, 0.0, 0.0),  # the test's own load, on one processor or on two
+        (0.2, 0.0, 0.0),
+        (0.04, 0.0, 0.06),
+        (0.1, 0.1, 0.1),  # another program on one of two processors
+        (0.05, 0.2, 0.1),
+        (0.15, 0.03, 0.03),
+    ],
+)
+def test_a_wait_for_the_tests_own_processes_is_no_lateness(tested_s, others_s, lateness_s):
+    assert of_others(0.1, tested_s, others_s) == pytest.approx(lateness_s)
+
+
+BUSY = "import time\nwhile time.process_time() < {s}: pass\nprint('done', flush=True)\ninput()"
+LOAD = "import subprocess, sys\nsubprocess.run([sys.executable, '-S', '-c', {busy!r}])"
+METER = """
+from support.witness import ProcessorTimes
+times = ProcessorTimes()
+print("begun", flush=True)
+input()
+print(*times.since(1e9))
+"""
+TEST = """
+import subprocess, sys
+pipes = {{"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}}
+meter = subprocess.Popen([sys.executable, "-c", {meter!r}], **pipes)
+meter.stdout.readline()
+load = subprocess.Popen([sys.executable, "-S", "-c", {load!r}], **pipes)
+print(load.stdout.readline(), end="", flush=True)
+input()
+print(meter.communicate("\\n")[0])
+load.communicate("\\n")
+"""
+
+
+def test_processor_times_are_told_apart_by_who_began_the_processes(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    script = TEST.format(meter=METER, load=LOAD.format(busy=BUSY.format(s=0.2)))
+    test = subprocess.Popen([sys.executable, "-c", script], **pipes)
+    assert test.stdout.readline() == "done\n"
+    other = subprocess.Popen([sys.executable, "-S", "-c", BUSY.format(s=1.0)], **pipes)
+    assert other.stdout.readline() == "done\n"
+    tested_s, others_s = map(float, test.communicate("\n")[0].split())
+    other.communicate("\n")
+    assert 0.2 <= tested_s < 1.0 <= others_s
 
 
 # -- no other test reads a clock -------------------------------------------------------------------

@@ -129,7 +129,6 @@ def _kill_at(child, path, size):
 @pytest.mark.parametrize("runs", [3, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
     rng = random.Random(8)
-    whole = 0
     for run in range(runs):
         path = tmp_path / str(run) / "run.mcap"
         path.parent.mkdir()
@@ -138,7 +137,7 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
             reported = b""
             while len(reported) < 6000 * 8:
                 reported += os.read(child.stdout.fileno(), 1 << 16)
-            _kill_at(child, path, rng.randrange(WHOLE))
+            _kill_at(child, path, rng.randrange(WHOLE) if run else sys.maxsize)
             child.stdout.read()
         before = fingerprint(path.parent)
         found, warnings = read(path)
@@ -147,9 +146,8 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
         if warnings:
             assert any(text in warnings[0] for text in ("none is missing", "is unknown", "whole"))
         with Session(path) as session:  # what was known at the end is in the log before it
-            whole += session.verdict == "good"
+            assert run or session.verdict == "good"
         shutil.rmtree(path.parent)
-    assert whole > 0
 
 
 def test_a_recording_that_runs_can_be_read(tmp_path, path):

@@ -52,7 +52,9 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
     clock = metadata_of(output)["undulog.clock"]
     unsure = float(clock["bus.drift_uncertainty_ppm"])
+    assert unsure < 10.0
     assert float(clock["bus.drift_ppm"]) == pytest.approx(80.0, abs=10.0 + 4 * unsure)
+    assert float(clock["bus.delay_p99_s"]) < 0.02
     assert int(clock["bus.samples"]) == sent
     assert clock["bus.resets"] == "0"
     assert np.abs(int(clock["bus.offset_ns"]) - (health.start_ns - 5 * NS)) < 60 * NS
