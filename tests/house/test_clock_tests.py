@@ -172,12 +172,9 @@ EXEMPT = {
     "mutants": "limits the tests of each mutant",
     "support/watcher.py": "limits every test",
     "support/witness.py": "measures how late the computer is",
-    "support/processes.py": "waits for events: wait_for",
+    "support/processes.py": "waits for events, wait_for; gives stages time, pause",
     "support/far_end.py": "a robot and a router that keep to time, as processes",
     "support/bus_listener.py": "a listener that keeps time, as a process",
-    "support/gate_stage.py": "waits for a quiet bus",
-    "support/recorders.py": "a sender that keeps a pace",
-    "support/serial_lines.py": "a line that keeps its baud rate",
 }
 
 
@@ -193,6 +190,17 @@ def reads_a_clock(node):
             limits = [*one.args, *(word.value for word in one.keywords if word.arg == "timeout")]
             if one.func.attr in WAITS and any(is_short(limit) for limit in limits):
                 return True
+    return False
+
+
+def gives_time(node):
+    """Whether code gives processes time, as stages under ``tests/support`` may."""
+    for one in ast.walk(node):
+        if isinstance(one, ast.ImportFrom) and one.module == "support.processes":
+            if "pause" in {alias.name for alias in one.names}:
+                return True
+        elif isinstance(one, ast.Attribute) and ast.unparse(one) == "processes.pause":
+            return True
     return False
 
 
@@ -254,7 +262,10 @@ def test_no_other_test_reads_a_clock():
         name = path.relative_to(tests).as_posix()
         if EXEMPT.keys() & {name, name.partition("/")[0]}:
             continue
-        if MAY_READ_A_CLOCK.search(path.read_text()):
+        text = path.read_text()
+        if "pause" in text and not name.startswith("support/") and gives_time(ast.parse(text)):
+            wrong.append(f"{name}: pause")
+        if MAY_READ_A_CLOCK.search(text):
             of_clock, faults = looked_at(path)
             marked += [f"{name}::{one}" for one in of_clock]
             wrong += [f"{name}: {one}" for one in sorted(faults)]

@@ -101,11 +101,11 @@ def tolerance_of(test):
     """Return the tolerance of a test that is marked ``clock`` [s]."""
     path, name = test.split("::")
     tree = ast.parse((ROOT / path).read_text())
-    (function,) = (one for one in tree.body if getattr(one, "name", "") == name)
+    (function,) = (node for node in tree.body if getattr(node, "name", "") == name)
     (mark,) = (
-        one
-        for one in function.decorator_list
-        if isinstance(one, ast.Call) and ast.unparse(one.func) == "pytest.mark.clock"
+        decorator
+        for decorator in function.decorator_list
+        if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == "pytest.mark.clock"
     )
     return ast.literal_eval(mark.args[0])
 
@@ -135,13 +135,13 @@ def main():
     missed = 0
     with tempfile.TemporaryDirectory(prefix="delays", ignore_cleanup_errors=True) as name:
         tree = Tree(Path(name))
-        for delay in (one for one in DELAYS if options.only in one.test):
+        for delay in (delay for delay in DELAYS if options.only in delay.test):
             delay_s, path = 2 * tolerance_of(delay.test), tree.root / delay.path
             whole = path.read_text()
             path.write_text(planted(whole, delay, delay_s))
             outcomes = [outcome_of(tree, delay.test) for _ in range(options.count)]
             path.write_text(whole)
-            counts = {one: outcomes.count(one) for one in ("failed", "passed", "not judged")}
+            counts = {kind: outcomes.count(kind) for kind in ("failed", "passed", "not judged")}
             missed += counts["failed"] < options.count
             listed = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
             function = delay.test.rpartition("::")[2]

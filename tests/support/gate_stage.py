@@ -8,7 +8,6 @@ import json
 import math
 import signal
 import sys
-import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from support.processes import UNDULOG, process, serving, wait_for
+from support.processes import UNDULOG, pause, process, serving, wait_for
 from support.twin_chains import snake4
 from support.witness import LateComputerError
 from support.written_sessions import write_commands
@@ -155,11 +154,11 @@ class Stage:
 
         A frame of our own is sent then: once the listener has it, it has all that came before.
         """
-        time.sleep(quiet_s)
+        pause(quiet_s)
         if self.lockstep:  # the robot is silent where nobody commands it
             heard = -1
             while heard != (heard := len(self.lines)):
-                time.sleep(2.0)
+                pause(2.0)
         elif self.robot.poll() is None:
             place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
             with can.Bus(interface="socketcand", **place) as bus:
@@ -211,7 +210,7 @@ class Driving:
 
     def signal(self, number, pause_s=0.0):
         self.controller.send_signal(number)
-        time.sleep(pause_s)
+        pause(pause_s)
 
     def communicate(self):
         out, err = self.controller.communicate(timeout=120)

@@ -91,6 +91,11 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=(), p
     return found
 
 
+def pause(seconds):
+    """Give other processes time; for stages alone, of tests that claim nothing of that time."""
+    time.sleep(seconds)
+
+
 @contextmanager
 def repeating(step, pause_s):
     """Call a function again and again in a thread, until the end of the block.

@@ -3,7 +3,6 @@
 import json
 import os
 import socket
-import time
 from collections import Counter
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from mcap.reader import make_reader
 
 from support.paths import ROOT
-from support.processes import UNDULOG, process, wait_for
+from support.processes import UNDULOG, pause, process, wait_for
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 from undulog.capture.recorder.control_client import ControlClient
@@ -104,13 +103,13 @@ def connected_sender(path):
         yield sender
 
 
-def send(path, frames, per_packet=50, pause_s=0.01, stamp=False):
-    """Send frames to a source ``unix:PATH``, as soon as it is there."""
+def send(path, frames, per_packet=50, pause_s=0.01, stamp_ns=None):
+    """Send frames to a source ``unix:PATH`` as soon as it is there; ``stamp_ns`` is a clock."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
         wait_for(lambda: sender.connect_ex(str(path)) == 0, "the source")
         for start in range(0, len(frames), per_packet):
             packet = frames[start : start + per_packet]
-            if stamp:
-                packet["t_device_ns"] = time.monotonic_ns() - np.arange(len(packet))[::-1] * 100_000
+            if stamp_ns:
+                packet["t_device_ns"] = stamp_ns() - np.arange(len(packet))[::-1] * 100_000
             sender.send(packet.tobytes())
-            time.sleep(pause_s)
+            pause(pause_s)

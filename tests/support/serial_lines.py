@@ -1,8 +1,11 @@
 """A serial line on a pseudo-terminal: what is written at one end is read at the other, paced."""
 
+import contextlib
 import os
-import time
 import tty
+from functools import partial
+
+from support.processes import pause, wait_for
 
 
 class Line:
@@ -18,19 +21,17 @@ class Line:
         self.byte_s = 10 / baud
 
     def send(self, data, most=64):
-        """Write bytes, some at a time; return the monotonic time at which the last was written."""
-        due = time.monotonic()
+        """Write bytes, some at a time."""
         for at in range(0, len(data), most):
             part = data[at : at + most]
-            due += len(part) * self.byte_s
-            while (left := due - time.monotonic()) > 0:
-                time.sleep(left)
+            pause(len(part) * self.byte_s)
             while part:
-                try:
-                    part = part[os.write(self.master, part) :]
-                except BlockingIOError:
-                    time.sleep(1e-4)
-        return time.monotonic()
+                part = part[wait_for(partial(self._write, part), "room in the line") :]
+
+    def _write(self, part):
+        with contextlib.suppress(BlockingIOError):
+            return os.write(self.master, part)
+        return 0
 
     def close(self):
         os.close(self.master)

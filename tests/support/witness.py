@@ -68,7 +68,7 @@ class ProcessorTimes:
         self.since(PROCESSES_S)
 
     def since(self, now_s):
-        """Return the processor times [s] since the last call: of the test's processes, of others."""
+        """Return the processor time [s] since the last call: of the test's processes, of others."""
         if now_s - self._listed_s >= PROCESSES_S:
             self._listed_s = now_s
             self._list()
@@ -83,7 +83,7 @@ class ProcessorTimes:
         return sums_s[True], sums_s[False]
 
     def _list(self):
-        processes = {int(name) for name in os.listdir("/proc") if name.isdigit()}
+        processes = {int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()}
         for process in processes:
             self._classify(process)
         self._taken_s = {process: self._taken_s.get(process, 0.0) for process in processes}

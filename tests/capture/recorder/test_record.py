@@ -233,11 +233,11 @@ def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path, out
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25", env=env) as process:
         wait_for(bus.exists, "the source's socket")
         began = time.monotonic()
-        send(bus, frames[:8000], stamp=True)
+        send(bus, frames[:8000], stamp_ns=time.monotonic_ns)
         wall.write_text("+3600\n")
-        send(bus, frames[8000:16000], stamp=True)
+        send(bus, frames[8000:16000], stamp_ns=time.monotonic_ns)
         wall.write_text("-3600\n")
-        send(bus, frames[16000:], stamp=True)
+        send(bus, frames[16000:], stamp_ns=time.monotonic_ns)
         took_s = time.monotonic() - began
         ended(process, signal.SIGINT)
     with Session.open(output) as session:
