@@ -45,6 +45,14 @@ def test_that_fails():
     assert False
 
 
+@pytest.mark.clock(1e9, "the witness saw nothing, a process of the test did")
+def test_of_real_time_that_saw_it_late():
+    with LOG.with_name("seen").open("a") as log:
+        log.write("x")
+    if len(LOG.with_name("seen").read_text()) < 3:
+        raise LateComputerError("0.1 s")
+
+
 def test_of_no_clock():
     assert not LOG.exists()
 
@@ -82,7 +90,7 @@ def test_only_a_late_computer_is_a_reason_to_run_a_test_again(tmp_path, monkeypa
         *("--junitxml", tmp_path / "junit.xml", tmp_path),
         env={"PATH": "", "PYTHONPATH": str(ROOT / "tests")},
     )
-    assert "1 failed, 3 passed, 2 not judged" in done.stdout, done
+    assert "1 failed, 4 passed, 2 not judged" in done.stdout, done
     assert done.stdout.count("NOT JUDGED") == 2
     assert "each_time: not judged: this computer was late by 0.2 s; 0.2 s; 0.2 s" in done.stdout
     assert "test_that_is_never_judged: not judged: this computer was late by 0.0" in done.stdout

@@ -4,7 +4,7 @@ They run after all others. A test that fails while the witness was later than th
 says nothing of the product: it is run again, and after five such tries it ends as *not judged*,
 which is no pass and no failure. ``WHY`` says what a simulated clock can't do here.
 
-Any other test that has processes of its own, and one among them that saw the computer late, raises
+Any test that has processes of its own, and one among them that saw the computer late, raises
 :class:`.witness.LateComputerError`: it is run again just so.
 """
 
@@ -72,9 +72,11 @@ def _begin_witness(item):
 def _late_for(item, reports):
     """Return how the computer was too late for a test that failed; empty if it wasn't."""
     failed = [report for report in reports if report.failed]
+    seen = [report.late_computer for report in failed]
+    if seen and all(seen):  # what else failed is a failure
+        return seen[0]
     if (tolerance_s := tolerance_of(item)) is None or not failed:
-        seen = [report.late_computer for report in failed]
-        return seen[0] if seen and all(seen) else ""  # what else failed is a failure
+        return ""
     late_s = _witness.late_s()
     return f"{late_s:.3f} s, more than {tolerance_s:g} s" if late_s > tolerance_s else ""
 
