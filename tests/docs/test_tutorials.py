@@ -12,7 +12,16 @@ PAGES = sorted(path.stem for path in DOCS.glob("tutorials/[a-z]*.md") if path.st
 MINUTES = 10
 PORT = "29536"
 LONG = {"body-or-module", "match-the-twin", "measure-coupling"}
-"""Twin runs of minutes: walked as ``make pages`` builds the manual, the others each time."""
+"""Twin runs of minutes: walked as ``make pages`` builds the manual."""
+FIRST = "first-bag"
+"""A stranger's first page, walked each time; the others each night."""
+
+
+def when(name):
+    """Return the mark of the walk through a page."""
+    if name in LONG:
+        return pytest.mark.built("tutorials")
+    return () if name == FIRST else pytest.mark.nightly
 
 
 def page_of(name: str) -> str:
@@ -36,10 +45,7 @@ def test_every_command_is_of_undulog_or_a_shell(name):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.built("tutorials") if name in LONG else ())
-        for name in PAGES
-    ],
+    [pytest.param(name, marks=when(name)) for name in PAGES],
 )
 def test_a_stranger_gets_from_an_empty_home_to_the_end_of_the_page(name, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:

@@ -54,7 +54,7 @@ def test_the_bill_tells_base_extras_and_development_apart(bill):
     assert {ref for refs_ in needs.values() for ref in refs_} <= refs
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_release_is_whole_and_its_builds_are_the_same_bytes(tmp_path):
     if processes.run("git", "rev-parse", "HEAD", cwd=ROOT).returncode:
         pytest.skip("not a git checkout: there is no last commit")

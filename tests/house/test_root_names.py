@@ -62,7 +62,7 @@ def test_every_name_can_be_imported_and_no_other():
     assert sorted([*homes, "run"]) == undulog.__all__
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_paths_and_open_sessions_give_the_same(runs):
     one = undulog.analyse(runs / "a.mcap")
     with undulog.Session.open(runs / "a.mcap") as session:
@@ -126,7 +126,7 @@ def test_the_command_has_one_thread_of_linear_algebra_unless_told():
     assert threads_of_numpy(OPENBLAS_NUM_THREADS="2") == 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_notebook_has_one_thread_of_linear_algebra_while_it_analyses(runs, monkeypatch):
     seen, analyse_session = [], undulog.analysis.analyse_session
 

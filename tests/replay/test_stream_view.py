@@ -149,6 +149,7 @@ def test_the_body_comes_first_and_whoever_looks_keeps_his_place(view, long_file,
     assert (code, err) == (0, "")
 
 
+@pytest.mark.nightly
 def test_a_tab_that_was_asked_for_comes_to_the_front_with_its_numbers(view, long_file, rgb):
     shown = view(long_file, "--tab", "cycles")
     until_the_body_stands(shown, rgb)
@@ -202,6 +203,7 @@ def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(shown):
     assert not Path(f"/proc/{viewer}").exists()
 
 
+@pytest.mark.nightly
 def test_who_looks_at_the_served_session_late_gets_its_beginning(view, long_file, rgb):
     shown = view(long_file, "--web")
     assert shown.page.startswith("http://127.0.0.1:")

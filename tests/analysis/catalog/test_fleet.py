@@ -201,7 +201,7 @@ def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
     assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path, command, report_of):
     for number in range(12):
         weak = np.diag(np.where(np.arange(M) == 2, 0.8 if number >= 6 else 1.0, 1.0))

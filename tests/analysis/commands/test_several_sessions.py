@@ -99,7 +99,7 @@ def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, 
     assert 'id="s2-answer"' in each.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_page_of_many_sessions_leaves_out_samples_then_refuses(
     folder, tmp_path, command, monkeypatch
 ):

@@ -39,7 +39,7 @@ def test_traces_are_the_samples(snake, recorded, monkeypatch, opened):
     assert traces[1].response_rad.size == 100
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_page_that_grows_too_large_goes_without_signals(snake, recorded, monkeypatch, opened):
     session = opened(recorded)
     full = render(snake, session)

@@ -42,7 +42,7 @@ def assert_no_placeholders(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["svg", "png"])
+@pytest.mark.parametrize("kind", ["svg", pytest.param("png", marks=pytest.mark.nightly)])
 def test_each_figure_of_the_page_is_a_file(kind, run, tmp_path, command):
     folder = tmp_path / "figures"
     line = ("report", run, "-o", tmp_path / "x.html", "--plots", folder, "--format", kind)

@@ -126,7 +126,7 @@ def _kill_at(child, path, size):
     child.kill()
 
 
-@pytest.mark.parametrize("runs", [3, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [3, pytest.param(30, marks=pytest.mark.nightly)])
 def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
     rng = random.Random(8)
     for run in range(runs):

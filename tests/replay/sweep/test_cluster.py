@@ -71,7 +71,7 @@ def test_rows_are_the_same_though_run_worker_and_scheduler_are_killed(local, tmp
     wait_for(lambda: not any(map(alive, seen | made)), "processes end with their workers", 20)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_path):
     plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
     words = (*UNDULOG, "sweep", plan, "-o", output, "--json")

@@ -74,7 +74,7 @@ def read_mutated(first, stop):
 
 
 @pytest.mark.parametrize(
-    ("first", "count"), [(0, 30), pytest.param(30, 270, marks=pytest.mark.slow)]
+    ("first", "count"), [(0, 30), pytest.param(30, 270, marks=pytest.mark.nightly)]
 )
 def test_a_few_hundred_mutated_files(first, count):
     came = read_mutated(first, first + count)
