@@ -65,6 +65,7 @@ def test_bags_are_rows_with_the_facts_of_their_sessions(bags):
         assert row["size"] == sum(file.stat().st_size for file in files)
 
 
+@pytest.mark.slow
 def test_bags_are_opened_again_only_when_a_file_of_theirs_has_changed(bags):
     catalog = Catalog(str(bags))
     catalog.scan()

@@ -69,16 +69,20 @@ DAMAGES = {
 }
 
 
-FAST = {("flipped", "sessions"), ("cut", "joints"), ("empty", "analyses"), ("folder", "sources")}
+FAST = {("flipped", "sessions"), ("empty", "analyses")}
+SLOW = {("cut", "joints"), ("folder", "sources")}
+
+
+def when(damage, kind):
+    """Return the mark of a damage: of each kind some are tried in every integration."""
+    if (damage, kind) in FAST:
+        return ()
+    return pytest.mark.slow if (damage, kind) in SLOW else pytest.mark.nightly
 
 
 @pytest.mark.parametrize(
     ("damage", "kind"),
-    [
-        pytest.param(damage, kind, marks=() if (damage, kind) in FAST else pytest.mark.nightly)
-        for damage in DAMAGES
-        for kind in KINDS
-    ],
+    [pytest.param(damage, kind, marks=when(damage, kind)) for damage in DAMAGES for kind in KINDS],
 )
 def test_a_damaged_file_is_set_aside_and_its_rows_are_read_again(lab, kind, damage):
     """Whichever file of a kind it is, also that of what was removed."""
