@@ -287,6 +287,18 @@ def test_what_is_dropped_is_always_the_oldest(tmp_path_factory, count, max_messa
     assert numbers
 
 
+def test_a_message_counts_with_its_record_head_in_what_may_wait(make, listen):
+    """The head of a record: kind, pad, channel, sequence, length, three times."""
+    feed = make(max_bytes=10 * (100 + 1 + 1 + 2 + 4 + 4 + 3 * 8))
+    listen()
+    pump_until(feed, lambda: feed.connected)
+    for number in range(10):
+        offer(feed, number, payload=bytes(100))
+    assert (feed.queued, feed.counts.dropped) == (10, 0)
+    offer(feed, 10, payload=b"")
+    assert (feed.queued, feed.counts.dropped) == (10, 1)
+
+
 def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
     feed, link = watched(max_messages=100)
     ticks = 0

@@ -156,6 +156,15 @@ def test_samples_without_a_device_time_among_others_are_stamped_by_their_arrival
     assert clock.result().drift_ppm == pytest.approx(40.0, abs=5.0)
 
 
+def test_a_new_estimate_after_a_failure_is_one_reset():
+    made = make()
+    clock = SourceClock()
+    mapped(clock, made)
+    clock.restart()
+    found = clock.result()
+    assert (found.resets, found.own_clock, found.drift_ppm) == (1, False, None)
+
+
 @pytest.mark.parametrize("first", ["restarts at zero", "is set an hour ahead", "is set back"])
 def test_a_clock_that_is_set_is_measured_anew(first):
     made = make(duration_s=80.0, drift_ppm=80.0)

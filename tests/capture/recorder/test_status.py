@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from support.simulated_clock import SimulatedClock
 from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.source_clock import ClockEstimate
 from undulog.capture.recorder.status import (
@@ -13,7 +14,9 @@ from undulog.capture.recorder.status import (
     NO_TIME_S,
     SILENT_S,
     SLOW_TICK_S,
+    EachSecond,
     RecorderSnapshot,
+    SessionClock,
     SourceSnapshot,
     TickTally,
     TopicSnapshot,
@@ -47,6 +50,30 @@ def of(name="recorder", **changes):
     """One status of a changed snapshot."""
     (found,) = [s for s in statuses(dataclasses.replace(SNAPSHOT, **changes)) if s.name == name]
     return found
+
+
+# -- clocks and schedules -------------------------------------------------------------------------
+
+
+def test_the_clock_of_a_session_is_the_wall_s_at_its_start_and_monotonic_since():
+    time = SimulatedClock(7_123_456_789, 1_700_000_000_987_654_321)
+    clock = SessionClock(time.clock)
+    assert clock.now_ns() == clock.epoch_ns == 1_700_000_008_111_111_110
+    time.wall_ahead_ns -= 3600 * 10**9
+    time.pass_s(1.5)
+    assert clock.now_ns() == clock.epoch_ns + 1_500_000_000
+
+
+def test_a_task_that_is_late_by_a_second_is_not_run_twice():
+    done = []
+    schedule = EachSecond([lambda: done.append(1)], 0)  # due at 0.5 s
+    for now_ns in (500_000_000, 2_499_999_999, 2_500_000_000, 3_499_999_999, 5_000_000_000):
+        schedule.run(now_ns)
+    assert len(done) == 4
+    schedule.run(5_999_999_999)
+    assert len(done) == 4
+    schedule.run(6_000_000_000)
+    assert len(done) == 5
 
 
 # -- the recorder and the session -----------------------------------------------------------------
