@@ -109,15 +109,15 @@ def annotations_of(text):
     return found
 
 
-def drawn(seed, count):
+def drawn(seed, count, parts=None):
     """Draw mutants, as many of each part, one a place at most."""
-    rng, chosen = random.Random(seed), []
-    for number, roots in enumerate(PARTS.values()):
+    rng, chosen, parts = random.Random(seed), [], parts or list(PARTS)
+    for number, part in enumerate(parts):
         places = {}
-        for path in modules(roots):
+        for path in modules(PARTS[part]):
             for mutant in mutants_of(path):
                 places.setdefault((mutant.path, mutant.line, mutant.column), []).append(mutant)
-        share = count // len(PARTS) + (number < count % len(PARTS))
+        share = count // len(parts) + (number < count % len(parts))
         some = rng.sample(sorted(places), min(share, len(places)))
         chosen += [rng.choice(sorted(places[place])) for place in some]
     return chosen
@@ -237,12 +237,14 @@ def main():
     parser = argparse.ArgumentParser(prog="mutants", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=210)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("-o", "--output", type=Path, default=Path("out/mutants"))
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     results = Mutants(options.output / f"seed{options.seed}.jsonl")
-    left = [one for one in drawn(options.seed, options.count) if one not in results.done]
+    chosen = drawn(options.seed, options.count, options.parts)
+    left = [one for one in chosen if one not in results.done]
     with tempfile.TemporaryDirectory(prefix="mutants", ignore_cleanup_errors=True) as name:
         trees = SimpleQueue()
         for number in range(options.jobs):
