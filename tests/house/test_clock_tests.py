@@ -161,17 +161,18 @@ def test_processor_times_are_told_apart_by_who_began_the_processes(monkeypatch):
 
 # -- no other test reads a clock -------------------------------------------------------------------
 
-CLOCKS = {
+TIMES = [
     "clock_gettime", "clock_gettime_ns", "monotonic", "monotonic_ns", "perf_counter",
     "perf_counter_ns", "process_time", "process_time_ns", "sleep", "thread_time", "thread_time_ns",
     "time", "time_ns",
-}  # fmt: skip
+]  # fmt: skip
+CLOCKS = {("threading", "Timer"), *(("time", name) for name in TIMES)}
 WAITS = {"wait", "join", "poll", "select"}
 LEAST_LIMIT_S = 10.0
 """A shorter limit of a wait is a time that something is given, not one after which a test fails."""
 MOST_CLOCK_TESTS = 40
 MAY_READ_A_CLOCK = re.compile(
-    r"import time|from time|\btime\.|timeout=|\.(wait|join|poll|select)\(\s*[\d.]|mark\.clock"
+    r"import time|from time|Timer|\btime\.|timeout=|\.(wait|join|poll|select)\(\s*[\d.]|mark\.clock"
 )
 EXEMPT = {
     "conftest.py": "limits every test",
@@ -189,8 +190,8 @@ EXEMPT = {
 def reads_a_clock(node):
     """Whether code calls a clock, sleeps, or waits for a short time."""
     for one in ast.walk(node):
-        if isinstance(one, ast.Attribute) and one.attr in CLOCKS:
-            if isinstance(one.value, ast.Name) and one.value.id == "time":
+        if isinstance(one, ast.Attribute) and isinstance(one.value, ast.Name):
+            if (one.value.id, one.attr) in CLOCKS:
                 return True
         elif isinstance(one, ast.ImportFrom) and one.module == "time":
             return True
@@ -297,6 +298,9 @@ def test_patient():
 def test_of_a_helper():
     pause()
 
+def test_of_a_timer():
+    threading.Timer(gap, stop).start()
+
 def test_of_no_clock():
     simulated.sleep(1)
 
@@ -307,4 +311,4 @@ def test_marked():
 """
     (tmp_path / "test_one.py").write_text(code)
     marked, wrong = looked_at(tmp_path / "test_one.py")
-    assert (marked, wrong) == ({"test_marked"}, {"test_of_a_helper"})
+    assert (marked, wrong) == ({"test_marked"}, {"test_of_a_helper", "test_of_a_timer"})

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -115,6 +116,26 @@ def repeating(step, pause_s):
     finally:
         ended.set()
         thread.join()
+
+
+@contextmanager
+def once(condition, then, what):
+    """Call a function as soon as a condition holds, in a thread, while the block waits for it."""
+
+    def watch():
+        wait_for(condition, what)
+        then()
+
+    with ThreadPoolExecutor(1) as pool:
+        watching = pool.submit(watch)
+        yield
+        watching.result()
+
+
+def processor_ticks(pid):
+    """Return what a process has computed so far, in ticks of the kernel."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(words[11]) + int(words[12])
 
 
 def alive(pid):

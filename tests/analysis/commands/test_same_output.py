@@ -5,8 +5,8 @@ import pytest
 from support.processes import UNDULOG, start, undulog
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", ["analyse", pytest.param("report", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("verb", ["analyse", "report"])
 def test_an_output_that_two_write_at_once_is_one_of_the_two(verb, tmp_path):
     undulog("sim", "run", "flat", "-o", "run.mcap", "--duration", "6", cwd=tmp_path, code=0)
     suffix = {"analyse": "json", "report": "html"}[verb]

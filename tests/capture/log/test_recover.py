@@ -91,11 +91,12 @@ def test_a_killed_session_reads_as_if_it_had_been_closed(path, run, split_size, 
 
 
 @pytest.mark.slow
-def test_thirty_kills_lose_no_accepted_message(tmp_path):
+@pytest.mark.parametrize("kills", [10, pytest.param(30, marks=pytest.mark.nightly)])
+def test_kills_lose_no_accepted_message(kills, tmp_path):
     rng = random.Random(5)
     with ThreadPoolExecutor(1) as killer:  # kills the next ones while one is checked
         killed = []
-        for run in range(30):
+        for run in range(kills):
             path = tmp_path / str(run) / "run.mcap"
             path.parent.mkdir()
             options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
@@ -475,7 +476,12 @@ def damage(rng, folder):
 
 
 @pytest.mark.parametrize(
-    ("runs", "total"), [(12, 900), pytest.param(500, 300, marks=pytest.mark.slow)]
+    ("runs", "total"),
+    [
+        (12, 900),
+        pytest.param(150, 300, marks=pytest.mark.slow),
+        pytest.param(500, 300, marks=pytest.mark.nightly),
+    ],
 )
 def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(
     tmp_path, runs, total

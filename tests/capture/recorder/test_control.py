@@ -1,11 +1,13 @@
 """The control socket against real clients: slow, silent, mad and many."""
 
 import contextlib
+import fcntl
 import os
 import resource
 import signal
 import socket
-import threading
+import struct
+import termios
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from support import control_clients as clients
-from support.processes import wait_for
+from support.processes import once, wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder import control
 from undulog.capture.recorder.control import BUFFER, MAX_CLIENTS, ControlServer
@@ -247,16 +249,22 @@ def test_the_reply_to_a_later_answer_comes_with_the_close(server):
         assert clients.replies(client.recv(4096)) == [{"ok": True, "verdict": "good"}]
 
 
+def unread_bytes(connection):
+    """What was sent on a socket, and not read at its other end [byte]."""
+    (count,) = struct.unpack("i", fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(4)))
+    return count
+
+
 def test_a_client_gets_an_error_when_the_recorder_dies_before_it_answers(tmp_path):
     path = tmp_path / "c.sock"
     with clients.started_recorder(path) as process, ControlClient(path) as client:
         client.ask({"do": "x"})
         process.send_signal(signal.SIGSTOP)
-        killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
-        killer.start()
-        with pytest.raises(ControlError, match="the recorder went"):
+        with (
+            once(lambda: unread_bytes(client._socket), process.kill, "it was asked"),
+            pytest.raises(ControlError, match="the recorder went"),
+        ):
             client.ask({"do": "x"})
-        killer.join()
 
 
 def test_a_recorder_that_hangs_is_reported(tmp_path):

@@ -38,7 +38,7 @@ def pids(output):
     return list(dict.fromkeys(int(name.rpartition(":")[2]) for name in names))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_are_the_same_though_run_worker_and_scheduler_are_killed(local, tmp_path):
     plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
     address = f"tcp://127.0.0.1:{port}"

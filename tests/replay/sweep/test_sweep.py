@@ -160,7 +160,10 @@ def temporary(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("temporary")
-@pytest.mark.parametrize("signals", [("SIGINT", "SIGKILL"), ("SIGTERM", "SIGINT")])
+@pytest.mark.parametrize(
+    "signals",
+    [("SIGINT", "SIGKILL"), pytest.param(("SIGTERM", "SIGINT"), marks=pytest.mark.nightly)],
+)
 def test_a_sweep_that_was_interrupted_twice_goes_on_where_it_stopped(signals, reference, tmp_path):
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
     words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")

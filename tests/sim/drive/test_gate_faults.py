@@ -117,7 +117,7 @@ def test_a_process_that_comes_late_does_not_jump(driving):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("plain", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
     with driving(plain=plain) as drive:
@@ -246,7 +246,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["hangup", "nohup"])
+@pytest.mark.parametrize("kind", ["hangup", pytest.param("nohup", marks=pytest.mark.nightly)])
 def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_path):
     path = tmp_path / "a.mcap"
     master, slave = pty.openpty()
@@ -285,7 +285,7 @@ def test_a_robot_that_is_gone_leaves_a_whole_session(driving):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("plain", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
     short = gate_stage.commanded(tmp_path / "short.mcap", small[0], 3.0)
     with driving(recorded=short, plain=plain) as drive:

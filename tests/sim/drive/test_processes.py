@@ -123,6 +123,7 @@ def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, a
         assert session.metadata["undulog"]["clock.can0"] == "host"
 
 
+@pytest.mark.nightly
 def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     with (
@@ -137,7 +138,13 @@ def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
         assert driven(*words, "--recorder", sockets[1], env=alone)["recorder"] == sockets[1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        *(pytest.param(n, marks=pytest.mark.nightly) for n in (signal.SIGINT, signal.SIGHUP)),
+    ],
+)
 def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     path = tmp_path / "a.mcap"
     part = unfinished_path(path)

@@ -3,13 +3,14 @@
 import json
 import sys
 import threading
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
 from support.foreign_logs import rewrite
-from support.processes import python
+from support.processes import once, python
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import Piece, helpers
@@ -209,10 +210,11 @@ def test_who_needs_a_result_does_not_wait_for_helpers_that_are_busy():
 
 def test_what_has_not_begun_is_left_undone_at_the_end():
     done, gate = [], threading.Event()
-    with helpers(3) as pool:
+    with ExitStack() as endings, helpers(3) as pool:
         for n in range(50):
             Piece(lambda n=n: (gate.wait(), done.append(n)), pool)
-        threading.Timer(0.05, gate.set).start()
+        waiting = pool._work_queue
+        endings.enter_context(once(lambda: waiting.qsize() <= 1, gate.set, "the rest is cancelled"))
     assert len(done) < 50
     assert not helpers_alive()
 
