@@ -160,7 +160,7 @@ def test_coefficients_are_mixtures_over_the_grid(alike):
     noises, weights = [GRID[0], GRID[9]], np.array([[[0.7], [0.3]], [[0.4], [0.6]]])
     fits = [_fit(line, noise, series) for noise in noises]
     rows = np.array([[1.0, 0.5]])
-    found = _mixture(fits, weights, rows, 12, alike=alike)
+    result = _mixture(fits, weights, rows, 12, alike=alike)
     for k in range(4):
         part = k // 2
         mean = np.array([(rows @ fit.beta[0])[0, k] for fit in fits])
@@ -179,8 +179,8 @@ def test_coefficients_are_mixtures_over_the_grid(alike):
             for q in (0.025, 0.975)
         ]
         centre = share @ mean
-        assert found.value[k] == pytest.approx(centre)
-        assert found.half[k] == pytest.approx(max(ends[1] - centre, centre - ends[0]), rel=1e-6)
+        assert result.value[k] == pytest.approx(centre)
+        assert result.half[k] == pytest.approx(max(ends[1] - centre, centre - ends[0]), rel=1e-6)
 
 
 def test_one_part_of_a_fit_is_gains_and_the_other_lags():
@@ -241,12 +241,13 @@ def test_a_trend_is_chosen_from_its_chance_on(kind, trials):
     assert chosen == [kind, "steady"]
 
 
-def test_a_transient_without_an_end_is_a_drift():
+@pytest.mark.parametrize("variance", [2e-4, 0.0])
+def test_a_transient_without_an_end_is_a_drift(variance):
     place = np.arange(20.0)
     series = 1 + 0.01 * scatter(9, 20, 3) + np.exp(-place / 50.0)
-    found = slow_changes(series, place, CycleNoise(np.full(6, 2e-4), 0.01, np.ones(20)))
-    assert found.trend is Trend.DRIFTING
-    assert np.isnan(found.tau[0])
+    result = slow_changes(series, place, CycleNoise(np.full(6, variance), 0.01, np.ones(20)))
+    assert result.trend is Trend.DRIFTING
+    assert np.isnan(result.tau[0])
 
 
 @pytest.mark.parametrize(("turn", "sizes"), [(0.0, (24, 1)), (0.8, (12, 16))])
@@ -287,9 +288,9 @@ def test_scatter_that_noise_explains_has_no_correlation():
             0.2,
             2.0,
         )
-        found = slow_changes(rows, place, explained(factor * variance))
-        assert (found.trend, found.excess) == (Trend.STEADY, pytest.approx(target))
-        assert (max(found.correlation) > 0) is correlated
+        result = slow_changes(rows, place, explained(factor * variance))
+        assert (result.trend, result.excess) == (Trend.STEADY, pytest.approx(target))
+        assert (max(result.correlation) > 0) is correlated
 
 
 def explained(variance):
@@ -300,8 +301,8 @@ def test_the_share_of_the_level_is_that_of_the_likeliest_trend():
     series = scatter(13, 14, 2)
     series[:2] *= 3
     noise = CycleNoise(10 * series.var(axis=1), 0.01, np.ones(14))
-    found = slow_changes(series, PLACE, noise)
-    assert found.trend is Trend.STEADY
-    assert found.share == pytest.approx((1 / 14, 1 / 14))
-    assert replace(found, turn=1.0).turn == 1.0
+    result = slow_changes(series, PLACE, noise)
+    assert result.trend is Trend.STEADY
+    assert result.share == pytest.approx((1 / 14, 1 / 14))
+    assert replace(result, turn=1.0).turn == 1.0
     assert transients(PLACE, np.array([2.0]), np.zeros(1)).designs.shape == (1, 14, 2)

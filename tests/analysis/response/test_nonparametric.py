@@ -112,22 +112,22 @@ def test_the_noise_of_a_tone_is_that_of_the_bins_beside_it():
     y = wave((0.7, 0.9), (1.9, 0.4)) + 0.1 * RNG.normal(size=COUNT) + 0.2 - 0.01 * T
     u = wave((0.7, 1.0), (1.9, 0.5))
     command, response = Series("u", T, u), Series("y", T, y)
-    found = tone_response(command, response, tones)
+    result = tone_response(command, response, tones)
     drift = np.stack([T**d for d in range(3)], axis=1)
     angle = 2 * np.pi * np.outer(T, tones)
     design = np.hstack([drift, np.cos(angle), np.sin(angle)])
     theta = np.linalg.lstsq(design, y, rcond=None)[0]
     amplitude = theta[3:5] - 1j * theta[5:]
     inputs = np.array([1.0, 0.5]) * np.exp(1j * (0.3 + tones))
-    np.testing.assert_allclose(found.value, amplitude / inputs, rtol=1e-6)
+    np.testing.assert_allclose(result.value, amplitude / inputs, rtol=1e-6)
     rest = y - design @ theta
     for k, tone in enumerate(tones):
         bins = _bins_beside(tone, tones, T[-1], 25.0)
         assert bins.size == 12
         power = np.abs(2 / COUNT * np.exp(-2j * np.pi * np.outer(bins, T)) @ rest) ** 2
         noise = np.median(power) / stats.expon.ppf(0.5)
-        assert found.variance[k] == pytest.approx(noise / np.abs(inputs[k]) ** 2, rel=0.1)
-        assert found.freedom[k] == pytest.approx(12 * np.log(2) ** 2)
+        assert result.variance[k] == pytest.approx(noise / np.abs(inputs[k]) ** 2, rel=0.1)
+        assert result.freedom[k] == pytest.approx(12 * np.log(2) ** 2)
     # Of a loop: of y - G u.
     mixed = Series("u", T, u + 0.1 * RNG.normal(size=COUNT))
     fed = Series("y", T, 0.5 * mixed.values)
@@ -187,7 +187,7 @@ def test_a_local_response_is_least_squares_in_its_window(inputs, order):
     spectra, output = circular(inputs, 60), circular(60)
     half = window(inputs, order)
     bins = np.array([2, 30, 58])
-    found = local_response(output, spectra, bins, half, order=order)
+    result = local_response(output, spectra, bins, half, order=order)
     for row, k in enumerate(bins):
         first = min(max(k - half, 1), 60 - (2 * half + 1))
         index = np.arange(first, first + 2 * half + 1)
@@ -199,11 +199,11 @@ def test_a_local_response_is_least_squares_in_its_window(inputs, order):
         noise = np.sum(np.abs(rest) ** 2) / freedom
         at = np.arange(inputs) * (order + 1)
         covariance = noise * np.linalg.inv(design.conj().T @ design)[np.ix_(at, at)]
-        np.testing.assert_allclose(found.value[row], theta[at], rtol=1e-6)
-        np.testing.assert_allclose(found.covariance[row], covariance, rtol=1e-6)
-        np.testing.assert_allclose(found.variance[row], np.diag(covariance).real, rtol=1e-6)
-        assert found.noise[row] == pytest.approx(noise)
-        assert found.freedom == freedom >= 6
+        np.testing.assert_allclose(result.value[row], theta[at], rtol=1e-6)
+        np.testing.assert_allclose(result.covariance[row], covariance, rtol=1e-6)
+        np.testing.assert_allclose(result.variance[row], np.diag(covariance).real, rtol=1e-6)
+        assert result.noise[row] == pytest.approx(noise)
+        assert result.freedom == freedom >= 6
 
 
 def test_the_least_window_leaves_its_degrees_of_freedom():

@@ -33,22 +33,22 @@ def test_a_response_has_the_variances_of_a_ratio():
     command, response = np.array([2.0, 1j, 0.0]), np.array([1j, 0.5, 1.0])
     asked = noise_of([np.diag([0.04, 0.01])] * 3, [10, 10, 10])
     given = noise_of([np.diag([0.02, 0.09])] * 3, [20, 20, 20])
-    found = respond(
+    result = respond(
         command, asked, response, given, omega_variance=0.25, delay_between_s=np.array([0, 2.0, 0])
     )
-    np.testing.assert_allclose(found.ratio[:2], [0.5j, -0.5j])
-    np.testing.assert_allclose(found.gain[:2], [0.5, 0.5])
+    np.testing.assert_allclose(result.ratio[:2], [0.5j, -0.5j])
+    np.testing.assert_allclose(result.gain[:2], [0.5, 0.5])
     # Along and across the direction of each amplitude, over its square.
     gains = [0.04 / 4 + 0.09, 0.01 + 0.02 / 0.25]
     lags = [0.01 / 4 + 0.02, 0.04 + 0.09 / 0.25]
-    np.testing.assert_allclose(found.log_gain_variance[:2], gains)
-    np.testing.assert_allclose(found.lag_variance[:2], [lags[0], lags[1] + 0.25 * 4])
+    np.testing.assert_allclose(result.log_gain_variance[:2], gains)
+    np.testing.assert_allclose(result.lag_variance[:2], [lags[0], lags[1] + 0.25 * 4])
     welch = lags[0] ** 2 / ((0.01 / 4) ** 2 / 10 + 0.02**2 / 20)
-    assert found.dof[0] == pytest.approx(welch)
-    assert np.isnan(found.ratio[2])
-    assert np.isnan(found.log_gain_variance[2])
-    assert found.errors is None
-    for estimated in (gain_estimate(found, 2), lag_estimate(found, 2)):
+    assert result.dof[0] == pytest.approx(welch)
+    assert np.isnan(result.ratio[2])
+    assert np.isnan(result.log_gain_variance[2])
+    assert result.errors is None
+    for estimated in (gain_estimate(result, 2), lag_estimate(result, 2)):
         assert (estimated.value, estimated.ci95) == (None, None)
 
 
@@ -57,7 +57,7 @@ def test_contrasts_are_judged_by_the_bins():
     bins = ResidualBins(values, np.array([1.0, -1.0]), np.ones(1), np.zeros((1, 2, 2)))
     more = replace(bins, values=3 * values)
     quiet = noise_of([np.eye(2)], [4])
-    found = respond(
+    result = respond(
         np.array([2.0 + 0j]),
         quiet,
         np.array([1.0 + 0j]),
@@ -66,8 +66,8 @@ def test_contrasts_are_judged_by_the_bins():
         delay_between_s=np.array([3.0]),
         bins=(bins, more),
     )
-    np.testing.assert_allclose(found.errors.bins, 3 * values / 1.0 - values / 2.0)
-    np.testing.assert_allclose(found.errors.turn, [1.5])
+    np.testing.assert_allclose(result.errors.bins, 3 * values / 1.0 - values / 2.0)
+    np.testing.assert_allclose(result.errors.turn, [1.5])
 
 
 def plain(ratio, variance=0.01, dof=9.0):
@@ -78,24 +78,24 @@ def plain(ratio, variance=0.01, dof=9.0):
 
 
 def test_lags_are_positive_where_the_response_is_late():
-    found = plain([np.exp(-0.3j), np.exp(0.3j), -1.0 + 0j, complex(-1.0, -0.0)])
-    np.testing.assert_allclose(found.lag_rad, [0.3, -0.3, np.pi, np.pi])
+    result = plain([np.exp(-0.3j), np.exp(0.3j), -1.0 + 0j, complex(-1.0, -0.0)])
+    np.testing.assert_allclose(result.lag_rad, [0.3, -0.3, np.pi, np.pi])
     turned = plain(np.exp(-1j * np.array([3.0, 3.3, 3.4])))
     np.testing.assert_allclose(
         turned.lag_near_mean_rad - turned.lag_near_mean_rad[0], [0, 0.3, 0.4]
     )
-    some = found.select([1, 0])
-    np.testing.assert_array_equal(some.ratio, found.ratio[[1, 0]])
+    some = result.select([1, 0])
+    np.testing.assert_array_equal(some.ratio, result.ratio[[1, 0]])
     assert some.errors.bins.shape == (2, 2)
     assert some.dof.tolist() == [9.0, 9.0]
     np.testing.assert_array_equal(some.lag_variance, 2 * some.log_gain_variance)
-    assert replace(found, errors=None).select([0]).errors is None
+    assert replace(result, errors=None).select([0]).errors is None
 
 
 def test_intervals_are_those_of_student():
-    found = plain([0.8 * np.exp(-0.3j)])
+    result = plain([0.8 * np.exp(-0.3j)])
     factor = stats.t.ppf(0.975, 9)
-    gain, lag = gain_estimate(found, 0), lag_estimate(found, 0)
+    gain, lag = gain_estimate(result, 0), lag_estimate(result, 0)
     assert gain.value == pytest.approx(0.8)
     assert gain.ci95 == pytest.approx((0.8 * np.exp(-factor / 10), 0.8 * np.exp(factor / 10)))
     half = np.arcsin(factor * np.sqrt(0.02))
@@ -125,8 +125,8 @@ def test_harmonics_stay_below_the_limit_of_the_slowest_channel():
 
 def test_three_cycles_are_a_rhythm():
     for cycles, there in ((2.9, False), (3.05, True)):
-        found = find_rhythm([sine(2 * np.pi * cycles / 10.0)], 10.0)
-        assert (found is not None) is there
+        result = find_rhythm([sine(2 * np.pi * cycles / 10.0)], 10.0)
+        assert (result is not None) is there
 
 
 def test_what_is_too_short_or_still_has_no_rhythm():
@@ -141,11 +141,11 @@ def test_what_is_too_short_or_still_has_no_rhythm():
 
 def test_channels_that_move_have_the_rhythm_in_their_order():
     still = Series("still", T, np.zeros(T.size))
-    found = find_rhythm([sine(3.0, name="b"), still, sine(3.0, size=2.0, name="a")], 10.0)
-    assert found.names == ("b", "a")
-    assert found.omega == pytest.approx(3.0)
-    rest = replace(found.fit, rss=np.array([1.0, 2.0]), total=np.array([8.0, 4.0]))
-    assert Rhythm(found.names, rest).explained == pytest.approx(0.75)
+    result = find_rhythm([sine(3.0, name="b"), still, sine(3.0, size=2.0, name="a")], 10.0)
+    assert result.names == ("b", "a")
+    assert result.omega == pytest.approx(3.0)
+    rest = replace(result.fit, rss=np.array([1.0, 2.0]), total=np.array([8.0, 4.0]))
+    assert Rhythm(result.names, rest).explained == pytest.approx(0.75)
 
 
 def test_the_livelier_channels_are_looked_at_first():
@@ -196,8 +196,8 @@ def test_steps_and_names_of_waves():
 
 
 def test_a_rhythm_is_refined_where_there_are_samples_enough():
-    found = refine([sine(3.0), sine(3.0, size=0.5)], 3.05)
-    assert found.omega == pytest.approx(3.0)
-    assert found.fit.count.tolist() == [1000.0, 1000.0]
+    result = refine([sine(3.0), sine(3.0, size=0.5)], 3.05)
+    assert result.omega == pytest.approx(3.0)
+    assert result.fit.count.tolist() == [1000.0, 1000.0]
     assert refine([sine(3.0), sine(3.0, T[:8])], 3.0) is None
     assert refine([Series("q", T, np.ones(T.size))], 3.0) is None
