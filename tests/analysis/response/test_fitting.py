@@ -244,6 +244,14 @@ def test_why_there_is_no_gait():
     assert "the best rhythms (0.5 Hz, 0.5 Hz) explain 0 % of" in two
 
 
+def test_what_never_moves_is_named_by_its_kind():
+    still = named(Series("a", T, np.ones(T.size)))
+    for commands, responses, kind in ((still, {}, "commands"), ({}, still, "responses")):
+        gait, notes = fitted(commands, responses)
+        assert gait is None
+        assert notes[0].startswith(f"no gait: the {kind} never move")
+
+
 def test_a_gait_explains_at_least_four_fifths():
     rng = np.random.default_rng(2)
     noise = rng.normal(size=T.size)
