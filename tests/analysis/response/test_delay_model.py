@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.response.delay_model import fit_delay, group_delay
+from undulog.analysis.response.delay_model import ORDERS, fit_delay, group_delay
 
 F_HZ = np.geomspace(0.2, 8.0, 40)
 
@@ -78,15 +78,22 @@ def test_the_group_delay_is_a_weighted_regression_of_the_phase():
     assert three[0] == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("variance", [3e-4, 1e-2])
 @pytest.mark.parametrize(
-    ("b", "a", "orders"), [((0.8,), (1, 0.7), (0, 1)), ((0.8, 0.3), (1, 0.5, 0.6), (1, 2))]
+    ("b", "a", "orders"),
+    [
+        ((0.8,), (1, 0.7), (0, 1)),
+        ((0.8,), (1, 0.5, 0.6), (0, 2)),
+        ((0.8, 0.9), (1, 0.5, 0.9), (1, 2)),
+        ((0.8, 0.1, 0.7), (1, 0.4, 1.2), (2, 2)),
+    ],
 )
-def test_exact_models_are_recovered(b, a, orders):
+def test_exact_models_are_recovered(b, a, orders, variance):
     omega = 2 * np.pi * F_HZ
     scale = np.exp(np.mean(np.log(omega)))
     s = 1j * omega / scale
     value = np.exp(-1j * omega * 0.015) * np.polyval(b[::-1], s) / np.polyval(a[::-1], s)
-    model = fit_delay(F_HZ, value, np.full(40, 3e-4), freedom=12)
+    model = fit_delay(F_HZ, value, np.full(40, variance), freedom=12)
     assert (model.orders, model.scale) == (orders, pytest.approx(scale))
     np.testing.assert_allclose(model.numerator, b, rtol=1e-5)
     np.testing.assert_allclose(model.denominator, a, rtol=1e-5)
@@ -96,6 +103,13 @@ def test_exact_models_are_recovered(b, a, orders):
     s = 2j * np.pi * between / scale
     exact = np.exp(-2j * np.pi * between * 0.015) * np.polyval(b[::-1], s) / np.polyval(a[::-1], s)
     np.testing.assert_allclose(model.response(between), exact, rtol=1e-4)
+
+
+def test_orders_are_tried_from_the_lowest_on():
+    sums = [sum(orders) for orders in ORDERS]
+    assert sums == sorted(sums)
+    assert len(set(ORDERS)) == len(ORDERS)
+    assert all(0 <= top <= bottom <= 3 for top, bottom in ORDERS)
 
 
 def test_the_standard_deviation_of_the_delay_is_that_of_least_squares():

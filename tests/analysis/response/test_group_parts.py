@@ -153,6 +153,11 @@ def test_mixed_tones_reach_to_the_sixth_order_and_the_resolution():
     for off, count in ((0.0149, 2), (0.0151, 0)):
         assert len(mixed_tones([1.0, 6.0 + off], duration_s)) == count
     assert mixed_tones([6.0, 1.0], duration_s)[0].group == 0
+    # The same below 1 rad/s, and with the sign turned where the sum is below zero.
+    slow = [(tone.group, dict(tone.factors)) for tone in mixed_tones([0.75, 0.5], duration_s)]
+    assert slow == [(0, {0: -1, 1: 3}), (1, {0: 2, 1: -2})]
+    turned = [(tone.group, dict(tone.factors)) for tone in mixed_tones([0.5, 0.75], duration_s)]
+    assert turned == [(0, {0: -2, 1: 2}), (1, {0: 3, 1: -1})]
 
 
 def test_limits_of_lines():
