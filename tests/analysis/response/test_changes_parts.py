@@ -387,3 +387,38 @@ def test_a_pace_that_moves_straightens_the_phase():
     assert moving_pace(steady, 1, fit_at(steady, OMEGA)) is None
     short = [series[0].between(0.0, 9.5)]
     assert moving_pace(short, 1, fit_at(short, OMEGA)) is None
+
+
+def swept(t, rate, size, name="c"):
+    return Series(name, t, size * np.cos(OMEGA * t + rate / 2 * (t - t.mean()) ** 2))
+
+
+def test_the_pace_is_the_mean_of_the_commands_by_their_information():
+    rate = 0.004
+    series = [swept(T, rate, 0.4), swept(T, 0.0, 0.2)]
+    fit = fit_at(series, OMEGA, HarmonicModel(harmonics=1))
+    for weight, share in (((1.0, 1.0), 0.8), ((1.0, 4.0), 0.5)):
+        result = moving_pace(series, 2, replace(fit, weight=np.array(weight)))
+        assert result.drift == pytest.approx(share * rate, rel=0.03)
+    # A command with a gap tells no phase; a response none at all.
+    kept = (T < 11.0) | (T > 14.0)
+    gap = [swept(T, rate, 0.4), Series("g", T[kept], series[1].values[kept]), series[1]]
+    fit = fit_at(gap, OMEGA, HarmonicModel(harmonics=1))
+    assert moving_pace(gap, 2, fit).drift == pytest.approx(rate, rel=0.03)
+    assert moving_pace(gap[1:2], 1, fit_at(gap[1:2], OMEGA)) is None
+
+
+def test_the_pace_of_many_cycles_is_that_of_several_together():
+    t, rate = np.arange(8100) / 10, 2e-5
+    series = [swept(t, rate, 0.4), swept(t[50:], rate, 0.3)]
+    fit = fit_at(series, OMEGA, HarmonicModel(harmonics=1))
+    assert moving_pace(series, 1, fit).drift == pytest.approx(rate, rel=0.02)
+    assert moving_pace(series, 2, fit).drift == pytest.approx(rate, rel=0.02)
+
+
+def test_a_pace_that_turns_time_back_is_none():
+    far = np.arange(3) * 4000.0 - 8000.0
+    series = [swept(T, 0.004, 0.4), Series("far", far, np.zeros(3))]
+    fit = fit_at(series[:1], OMEGA, HarmonicModel(harmonics=1))
+    assert moving_pace(series[:1], 1, fit) is not None
+    assert moving_pace(series, 1, fit) is None
