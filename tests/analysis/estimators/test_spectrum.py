@@ -132,6 +132,23 @@ def test_rounding_that_the_bins_do_not_show_counts_instead_of_them():
     assert noise.dof[0] == draws(1000) == 48
 
 
+def test_rounding_counts_from_thirteen_tenths_of_the_noise_on(monkeypatch):
+    t, step = np.arange(1000) / 50, 2 * np.pi / 4096
+    series = [Series("q", t, step * np.rint(0.4 * np.sin(np.pi * t + 0.3) / step))]
+    fit = fit_at(series, np.pi)
+    name = "undulog.analysis.estimators.spectrum.rounding_covariance"
+    monkeypatch.setattr(name, lambda *_: np.zeros((2, 2)))
+    noise = residual_noise(series, fit)
+    for factor, dof in ((1.28, noise.dof[0]), (1.32, 48.0)):
+        monkeypatch.setattr(name, lambda *_, factor=factor: factor * noise.covariance[0])
+        raised = residual_noise(series, fit)
+        assert raised.dof[0] == dof
+        expected = factor if dof == 48 else 1.0
+        np.testing.assert_allclose(
+            raised.covariance, expected * noise.covariance, rtol=1e-6, atol=1e-24
+        )
+
+
 def test_pairs_that_a_fit_took_are_left_out():
     transform = np.arange(1.0, 7.0)[None] + 1j
     kept = np.array([9.0, 6.0, 8.0, 4.0, 5.1, 7.0])
