@@ -373,7 +373,7 @@ def _comb(phase: FloatArray, values: FloatArray) -> FloatArray:
     """Mean over one cycle around each sample, NaN where that reaches beyond the samples; (n,)."""
     step = np.diff(phase)
     area = np.concatenate(([0.0], np.cumsum((values[1:] + values[:-1]) / 2 * step)))
-    slack = 1e-9 + (float(step.mean()) if step.size else 0.0)
+    slack = 1e-9 + float(step.mean())
     inside = (phase - np.pi >= phase[0] - slack) & (phase + np.pi <= phase[-1] + slack)
     mean = (np.interp(phase + np.pi, phase, area) - np.interp(phase - np.pi, phase, area)) / _TURN
     return np.where(inside, mean, np.nan)
