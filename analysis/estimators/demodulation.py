@@ -336,7 +336,7 @@ def _moments(
         own = starts[first : first + many + 1]
         part = slice(int(own[0]), int(own[-1]))
         rows = np.empty((14, part.stop - part.start))
-        turns = rows[:8].reshape(4, 2, -1)
+        turns = rows[:8].reshape(4, 2, rows.shape[1])
         turns[0, 0], turns[0, 1] = cos_sin(phase[part])
         double = 2 * turns[0, 0]
         np.multiply(double, turns[0], out=turns[1])
@@ -348,7 +348,7 @@ def _moments(
         np.multiply(rows[:4], rows[8], out=rows[9:13])
         np.multiply(rows[8], rows[8], out=rows[13])
         sums[:, first : first + many] = cycle_sums(rows, own - own[0])
-    return sums[:8].reshape(4, 2, -1), sums[8:13], sums[13]
+    return sums[:8].reshape(4, 2, count), sums[8:13], sums[13]
 
 
 def _normal(filled: FloatArray, waves: FloatArray) -> FloatArray:
@@ -373,7 +373,7 @@ def _comb(phase: FloatArray, values: FloatArray) -> FloatArray:
     """Mean over one cycle around each sample, NaN where that reaches beyond the samples; (n,)."""
     step = np.diff(phase)
     area = np.concatenate(([0.0], np.cumsum((values[1:] + values[:-1]) / 2 * step)))
-    slack = 1e-9 + (float(step.mean()) if step.size else 0.0)
+    slack = 1e-9 + float(step.mean())
     inside = (phase - np.pi >= phase[0] - slack) & (phase + np.pi <= phase[-1] + slack)
     mean = (np.interp(phase + np.pi, phase, area) - np.interp(phase - np.pi, phase, area)) / _TURN
     return np.where(inside, mean, np.nan)

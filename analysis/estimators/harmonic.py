@@ -146,7 +146,7 @@ def basis(
         place = model.trend + 1 + 2 * k
         rows[place], sine = cos_sin(line * t_s)
         np.negative(sine, out=rows[place + 1])
-    turned = rows[model.first : model.size].reshape(model.harmonics, 2, -1)
+    turned = rows[model.first : model.size].reshape(model.harmonics, 2, t_s.size)
     turned[0, 0], sine = cos_sin(omega * t_s)
     np.negative(sine, out=turned[0, 1])
     # cos((h + 1) x) = 2 cos x cos(h x) - cos((h - 1) x), and the sine likewise.
@@ -248,7 +248,7 @@ def _turned(harmonic: FloatArray, model: HarmonicModel) -> FloatArray:
     The derivative of cos(h x) is h times -sin(h x), and that of -sin(h x) is -h times cos(h x).
     """
     order = np.arange(1, model.harmonics + 1.0)[:, None]
-    parts = harmonic.reshape(model.harmonics, 2, -1)
+    parts = harmonic.reshape(model.harmonics, 2, harmonic.shape[1])
     return np.stack([order * parts[:, 1], -order * parts[:, 0]], axis=1).reshape(harmonic.shape)
 
 
@@ -329,7 +329,9 @@ class HarmonicFit:
         index = np.asarray(channels, dtype=np.int64)
         trend = self.trend[index] * scale ** np.arange(self.model.trend + 1.0)
         parts = np.concatenate([self.lines[index], self.amplitudes[index]], axis=1)
-        harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(index.size, -1)
+        harmonic = np.stack([parts.real, parts.imag], axis=2).reshape(
+            len(parts), 2 * parts.shape[1]
+        )
         return np.concatenate([trend, harmonic], axis=1)
 
     def predict(self, channel: int | IntArray, t_s: FloatArray) -> FloatArray:
@@ -343,7 +345,7 @@ class HarmonicFit:
             Values in the channel's unit, shape of ``t_s``, after m where there are indices.
         """
         index = np.atleast_1d(channel)
-        theta, times = self.parameters(index, 1.0), t_s.reshape(-1)
+        theta, times = self.parameters(index, 1.0), t_s.ravel()
         value = np.empty((index.size, times.size))
         for part in chunks(times.size):
             np.matmul(theta, basis(times[part], self.omega, self.model, 1.0), out=value[:, part])
@@ -452,7 +454,7 @@ def _gathered(
         theta = one.theta + one.drift * (step * moments.scale)
         trend[k] = (theta[: model.trend + 1] * scale[:, None]).T
         trend[k, 0] += moments.mean
-        parts = theta[model.first :].reshape(model.harmonics, 2, -1)
+        parts = theta[model.first :].reshape(model.harmonics, 2, len(k))
         amplitudes[k] = (parts[:, 0] + 1j * parts[:, 1]).T
         others = theta[model.trend + 1 : model.first].reshape(len(model.lines), 2, len(k))
         lines[k] = (others[:, 0] + 1j * others[:, 1]).T

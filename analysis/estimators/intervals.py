@@ -98,8 +98,8 @@ def response_errors(
         np.divide(1.0, amplitude, out=inverse, where=known)
         parts.append((inverse * np.sqrt(found.spread))[:, None] * found.values)
         # Multiplied by 1/a, errors of (Re a, Im a) become those of (ln|a|, arg a).
-        turned = np.stack([inverse, 1j * inverse], axis=-1)
-        turned = np.stack([turned.real, turned.imag], axis=-2)
+        turned = np.stack([inverse, 1j * inverse], axis=1)
+        turned = np.stack([turned.real, turned.imag], axis=1)
         rounding += turned @ found.rounding @ turned.transpose(0, 2, 1)
     turn = np.zeros(response.size) + omega_variance**0.5 * np.asarray(delay_between_s)
     return ResponseErrors(parts[0] - parts[1], rounding, turn)
@@ -257,7 +257,9 @@ def _norm(
     value: FloatArray | ComplexArray, noise: FloatArray | ComplexArray
 ) -> tuple[float, float]:
     """Return the norm without what noise adds, and the quantile of the noise's own norm."""
-    sizes: FloatArray = np.linalg.norm(noise.reshape(len(noise), -1), axis=1).astype(np.float64)
+    sizes: FloatArray = np.linalg.norm(noise.reshape(len(noise), value.size), axis=1).astype(
+        np.float64
+    )
     squared = float(np.linalg.norm(value)) ** 2 - float(np.mean(sizes**2))
     # Two norms share the 5 %.
     return max(0.0, squared) ** 0.5, float(np.quantile(sizes, 1 - (1 - CONFIDENCE) / 2))

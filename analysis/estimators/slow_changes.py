@@ -244,7 +244,7 @@ def _fit(shapes: Shapes, noise: _Noise, series: FloatArray) -> _Fits:
         rest -= right
         np.einsum("sck,sck->sk", rest, rest, out=rss[some])
     np.maximum(rss, _TINY, out=rss)
-    logs = np.log(rss).reshape(-1, 2, k // 2).sum(axis=2)
+    logs = np.log(rss).reshape(len(q), 2, k // 2).sum(axis=2)
     information = 2 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
     # Over |X' X|, or it would depend on the scale of the columns.
     plain = np.linalg.slogdet(np.swapaxes(shapes.designs, 1, 2) @ shapes.designs)[1]
@@ -368,12 +368,12 @@ def _zoomed(
         if spread >= _ENOUGH**shapes.free:
             break
         kept = weights >= _LEAST_WEIGHT
-        tau = finer(shapes.tau, kept, 24 // shapes.free, lowest, highest)
         if shapes.free == 1:
-            shapes = transients(place, tau, np.zeros(1))
+            tau, turn = finer(shapes.tau, kept, 24, lowest, highest), np.zeros(1)
         else:
+            tau = finer(shapes.tau, kept, 12, lowest, highest)
             turn = finer(shapes.turn, kept, 16, 1e-3, np.pi - 1e-3)
-            shapes = transients(place, tau, turn)
+        shapes = transients(place, tau, turn)
     return shapes
 
 

@@ -69,7 +69,7 @@ class Noise:
         Returns:
             Variances, shape (K,).
         """
-        unit = np.stack([direction.real, direction.imag], axis=-1)
+        unit = np.stack([direction.real, direction.imag], axis=1)
         return np.einsum("ki,kij,kj->k", unit, self.covariance, unit)
 
 
@@ -211,7 +211,8 @@ def _common_bins(
     rounding: FloatArray,
 ) -> ResidualBins:
     """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
-    pairs = np.min([one.kept / one.count for one in found], axis=0).reshape(-1, 2).min(axis=1)
+    kept = np.min([one.kept / one.count for one in found], axis=0)
+    pairs = np.minimum(kept[::2], kept[1::2])
     usable = np.repeat(pairs > min(KEPT_POWER, 0.999 * float(pairs.max())), 2)
     values = np.zeros((spread.size, np.count_nonzero(usable)), dtype=np.complex128)
     for members, one in zip(groups, found, strict=True):
@@ -335,7 +336,7 @@ def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> Com
     """
     first, h = model.first, model.harmonics
     sums = np.add.reduceat(rows, edges, axis=1)
-    parts = sums[first:].reshape(h + 1, 2, -1)
+    parts = sums[first:].reshape(h + 1, 2, edges.size)
     back: ComplexArray = parts[:, 0] + 1j * parts[:, 1]  # exp(-j m x), m = 1 .. h + 1
     below = np.concatenate((sums[:1], back[: h - 1].conj()))
     turned = np.empty((model.size, edges.size), dtype=np.complex128)

@@ -100,5 +100,5 @@ def transients(place: FloatArray, tau: FloatArray, turn: FloatArray) -> Shapes:
     angle = turns[:, None] * place
     parts = [np.ones(decay.shape), decay * np.cos(angle), decay * np.sin(angle)]
     if not turn.any():
-        return Shapes("settling", np.stack(parts[:2], axis=-1), taus, turns, 1)
-    return Shapes("ringing", np.stack(parts, axis=-1), taus, turns, 2)
+        return Shapes("settling", np.stack(parts[:2], axis=2), taus, turns, 1)
+    return Shapes("ringing", np.stack(parts, axis=2), taus, turns, 2)

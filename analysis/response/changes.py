@@ -111,7 +111,9 @@ class ResponseChanges:
     def of_joint(self, joint: int) -> tuple[Estimate, Estimate]:
         """Return :attr:`.SlowChanges.change` of log gain and of lag [rad] of one joint."""
         size = float(np.abs(self._level[joint]))
-        gain_half, lag_half = (self.found.change.half.reshape(2, -1)[:, joint] / size).tolist()
+        gain_half, lag_half = (
+            self.found.change.half.reshape(2, self.reference.size)[:, joint] / size
+        ).tolist()
         change = complex(self.per_joint[joint])
         return (
             Estimate(change.real, around(change.real, gain_half)),
@@ -120,7 +122,7 @@ class ResponseChanges:
 
     @property
     def _level(self) -> ComplexArray:
-        gain, phase = self.found.level.value.reshape(2, -1)
+        gain, phase = self.found.level.value.reshape(2, self.reference.size)
         return gain + 1j * phase
 
     @property
@@ -134,7 +136,7 @@ class ResponseChanges:
     @property
     def per_joint(self) -> ComplexArray:
         """:attr:`.SlowChanges.change` of ln H, shape (m,)."""
-        gain, phase = self.found.change.value.reshape(2, -1)
+        gain, phase = self.found.change.value.reshape(2, self.reference.size)
         return np.asarray((gain + 1j * phase) / self._level)
 
     @property
@@ -177,7 +179,7 @@ def response_changes(
         found.excess,
         2 * np.pi / fit.omega,
         cycles.number.size,
-        np.sqrt(np.maximum(scatter, 0.0)).reshape(2, -1) * (found.excess < EXCESS),
+        np.sqrt(np.maximum(scatter, 0.0)).reshape(2, reference.size) * (found.excess < EXCESS),
         _amplitude_drift(cycles),
     )
 
@@ -192,19 +194,20 @@ def with_changes(response: Response, changes: ResponseChanges) -> Response:
     moving = found.trend is not Trend.STEADY or changes.amplitude_drift is not None
     if not moving and changes.excess > _CLEAR_EXCESS:
         return response
-    level = found.level.value.reshape(2, -1)
+    shape = (2, changes.reference.size)
+    level = found.level.value.reshape(shape)
     size = np.hypot(*level)
     relative = level[0] + 1j * level[1]
     factor = t_factor(found.dof)
     # Turned into the direction of the level, whose angle is small.
-    own = (found.level.half.reshape(2, -1) / size / factor) ** 2
+    own = (found.level.half.reshape(shape) / size / factor) ** 2
     dof = np.full(size.size, found.dof)
     if not moving:
         known = np.stack([response.log_gain_variance, response.lag_variance])
         before = known * (np.array([t_factor(each) for each in response.dof]) / factor) ** 2
         own = np.maximum(own, before) if found.alike else own
         relative = response.ratio / changes.reference
-    half = found.residuals.reshape(2, size.size, -1)
+    half = found.residuals.reshape(*shape, found.residuals.shape[1])
     bins = np.sqrt(found.share[0]) * half[0] + 1j * np.sqrt(found.share[1]) * half[1]
     circular = np.mean(np.abs(bins) ** 2, axis=1) / 2
     rounding = np.zeros((size.size, 2, 2))
@@ -249,7 +252,7 @@ def _cycles(
         return None
     whole = whole[:, :, usable]
     mean = fit.fundamental[channels[1]] / fit.fundamental[channels[0]]
-    variances = noise.reshape(2, -1).sum(axis=0)
+    variances = noise.reshape(2, len(commands)).sum(axis=0)
     number = several * np.flatnonzero(usable).astype(np.float64)
     return Cycles(number, whole[0], whole[1] / whole[0] * mean[:, None], variances)
 

@@ -410,7 +410,7 @@ def _candidates(
 
 
 def _periodogram(series: Sequence[Series], fit: HarmonicFit, omegas: FloatArray) -> FloatArray:
-    """|sum of the residual times exp(-j omega t)|^2 / n of each channel, shape (k, f)."""
+    """|sum of the residual times exp(j omega t)|^2 / n of each channel, shape (k, f)."""
     power = np.zeros((len(series), omegas.size))
     for members in shared_times(series):
         t_s = series[members[0]].t_s
@@ -418,7 +418,7 @@ def _periodogram(series: Sequence[Series], fit: HarmonicFit, omegas: FloatArray)
         for part in chunks(t_s.size):
             rest = np.stack([series[k].values[part] for k in members])
             rest -= fit.predict(np.array(members), t_s[part])
-            total += rest @ np.exp(-1j * np.outer(t_s[part], omegas))
+            total += rest @ np.exp(1j * np.outer(t_s[part], omegas))
         power[members] = np.abs(total) ** 2 / t_s.size
     return power
 

@@ -199,3 +199,20 @@ def test_a_positive_quantity_has_its_weighted_quantiles():
     np.testing.assert_allclose(found, np.quantile(draws, [0.5, 0.025, 0.975]), rtol=1e-3)
     three = positive_interval(np.array([4.0, 1.0, 2.0]), np.array([0.25, 0.25, 0.5]))
     assert three == pytest.approx((2.0, 1.0, 4.0))  # running middles: 0.125, 0.5, 0.875
+
+
+def test_ends_of_a_mixture_are_reached_by_newtons_steps(monkeypatch):
+    """Six of them: with a density that is off they would not be there."""
+    monkeypatch.setattr("undulog.analysis.estimators.intervals._MOST_STEPS", 6)
+    rng = np.random.default_rng(3)
+    share, dof = np.array([[0.5], [0.3], [0.2]]), 7
+    mean, scale = rng.normal(size=(3, 50)), rng.uniform(0.8, 1.6, (3, 50))
+    centre, half = mixture_interval(share, mean, scale, dof)
+    for end, quantile in ((centre + half, 0.975), (centre - half, 0.025)):
+        below = (share * stats.t.cdf((end - mean) / scale, dof)).sum(axis=0)
+        # The wider side of each reaches its quantile, the other lies beyond it.
+        assert (np.sign(quantile - 0.5) * (below - quantile) > -1e-12).all()
+    low = (share * stats.t.cdf((centre - half - mean) / scale, dof)).sum(axis=0)
+    high = (share * stats.t.cdf((centre + half - mean) / scale, dof)).sum(axis=0)
+    worst = np.minimum(np.abs(low - 0.025), np.abs(high - 0.975))
+    assert worst.max() < 1e-10
