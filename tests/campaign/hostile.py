@@ -89,11 +89,13 @@ def chunk_indexed(times):
 
 
 def many_channels(count, *, joints):
-    inside = schema() if joints else schema(1, "std_msgs/msg/String")
+    head = schema() if joints else schema(1, "std_msgs/msg/String")
     payload = joint_state(EPOCH_NS, ["a"], [0.1]) if joints else b"\0\1\0\0" + text("x\0")
-    for number in range(1, count + 1):
-        inside += channel(number, f"/t{number}") + message(number, EPOCH_NS + number, payload)
-    return HEADER + chunk(inside) + END
+    records = (
+        channel(number, f"/t{number}") + message(number, EPOCH_NS + number, payload)
+        for number in range(1, count + 1)
+    )
+    return HEADER + chunk(b"".join([head, *records])) + END
 
 
 def many_joints(count):
