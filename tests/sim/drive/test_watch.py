@@ -1,4 +1,4 @@
-"""What the gate watches: silence of the bus, joints that are lost or beyond a limit, who is there."""
+"""What the gate watches: whether the bus is silent, joints lost or beyond a limit, who is there."""
 
 import dataclasses
 
