@@ -7,6 +7,7 @@ little of some others are enough to choose colours, scales and the joints that s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -278,7 +279,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         samples={
             entity: tuple(
                 one_after_another(own[name])
-                for name in sorted(own, key=lambda name: chain.get(name, 1 << 30))
+                for name in sorted(own, key=lambda name: chain.get(name, math.inf))
             )
             for entity, own in lines.items()
         },
@@ -371,5 +372,5 @@ def _in_order(
     parts: Sequence[tuple[str, ...]], chain: Mapping[str, int]
 ) -> tuple[tuple[str, ...], ...]:
     """Parts in the order of their first lines, lines in chain order."""
-    inside = [tuple(sorted(part, key=lambda name: chain.get(name, 1 << 30))) for part in parts]
-    return tuple(sorted(inside, key=lambda part: chain.get(part[0], 1 << 30)))
+    inside = [tuple(sorted(part, key=lambda name: chain.get(name, math.inf))) for part in parts]
+    return tuple(sorted(inside, key=lambda part: chain.get(part[0], math.inf)))

@@ -1,5 +1,6 @@
 """Joint samples: tables of common times, resampling against closed forms, and rounding."""
 
+import itertools
 import statistics
 
 import numpy as np
@@ -72,6 +73,22 @@ def test_joints_in_turn_have_one_sample_between_two_of_the_first():
     assert not tracks.in_turn(t, t[::2] + 3)
     assert not tracks.in_turn(t, np.sort(np.concatenate([t + 3, t + 6])))
     assert not tracks.in_turn(t, t[:0])
+
+
+increasing = st.lists(st.integers(1, 6), min_size=1, max_size=8).map(np.cumsum)
+
+
+@given(increasing, increasing, st.integers(-8, 8))
+def test_turns_are_one_between_any_two_of_the_first_but_at_an_end(first, other, shift):
+    other = other + shift
+    counts = [np.sum((other >= a) & (other < b)) for a, b in itertools.pairwise(first)]
+    taken = np.flatnonzero(counts)
+    expected = (
+        len(taken) >= max(len(first) - 2, 1)
+        and np.ptp(taken) == len(taken) - 1
+        and max(counts) == 1
+    )
+    assert tracks.in_turn(first.astype(np.int64), other.astype(np.int64)) == expected
 
 
 def test_joints_in_turn_are_brought_to_the_first_ones_times():
@@ -169,6 +186,15 @@ def test_silence_before_the_end_is_a_gap():
     np.testing.assert_array_equal(both[0], ticks(0, 10, 20, 30, 100, 110))
     whole = tracks.mark_gaps(t, values, end_ns=40 * MS)
     assert all(one is given for one, given in zip(whole, (t, values), strict=True))
+
+
+@given(st.lists(st.integers(0, 9), max_size=8))
+def test_any_order_becomes_that_of_a_stable_sort(times):
+    t, values = np.array(times, dtype=np.int64), np.arange(float(len(times)))
+    found = tracks.ordered(t, values)
+    order = sorted(range(len(times)), key=times.__getitem__)
+    np.testing.assert_array_equal(found[0], t[order])
+    np.testing.assert_array_equal(found[1], values[order])
 
 
 def test_samples_out_of_order_are_sorted():
