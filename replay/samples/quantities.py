@@ -121,8 +121,8 @@ def power_limit(power_w: FloatArray) -> float:
         power is known or all of it is zero.
     """
     known = np.abs(power_w[np.isfinite(power_w)])
-    limit = float(np.percentile(known, 99.0)) if known.size else 0.0
-    if limit <= 0.0:
+    limit = known.size and float(np.percentile(known, 99.0))
+    if not limit:
         return 1.0
     unit = 10.0 ** (np.floor(np.log10(limit)) - 1.0)
     return float(np.ceil(limit / unit) * unit)
@@ -197,7 +197,7 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
 GAIT = "/gait"
 
 _KEPT = 4000  # samples of each line that are kept, about
-_CONTEXT_NS = (500_000_000, 60_000_000_000)
+_LEAST_CONTEXT_NS, _MOST_CONTEXT_NS = 500_000_000, 60_000_000_000
 _REACH_STEPS = 1.2 * GAP_STEPS
 
 _LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
@@ -257,11 +257,12 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     times: list[IntArray] = []
     powers: list[FloatArray] = []
     seen: dict[tuple[str, str], set[str]] = {}
-    step_ns = 0
+    context_ns = _LEAST_CONTEXT_NS
     for columns in _columns(session, wanted, looks):
         for key, tracks in columns.items():
             seen.setdefault(key, set()).update(track.name for track in tracks)
-            step_ns = max([step_ns, *(typical_step_ns(track.t_ns) for track in tracks)])
+            reaches_ns = (round(_REACH_STEPS * typical_step_ns(track.t_ns)) for track in tracks)
+            context_ns = max(context_ns, *reaches_ns)
         for entity, tracks in quantities(columns).items():
             own = lines.setdefault(entity, {})
             for track in tracks:
@@ -286,7 +287,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         parts={entity: _in_order(found, chain) for entity, found in parts.items()},
         drawing_ns=np.concatenate([np.zeros(0, dtype=np.int64), *times]),
         power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
-        context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
+        context_ns=min(context_ns, _MOST_CONTEXT_NS),
         seen=seen,
         is_whole=not looks,
     )

@@ -64,6 +64,7 @@ def test_a_total_is_at_the_first_ones_times_and_unknown_where_one_is():
         (np.r_[np.full(1000, -0.123), 50.0, np.nan], 0.13),  # rounded up to two digits
         (np.full(3, 1234.0), 1300.0),
         (np.zeros(4), 1.0),
+        (np.r_[np.zeros(999), 5.0], 1.0),  # nearly all of it
         (np.full(2, np.nan), 1.0),
     ],
 )

@@ -207,6 +207,11 @@ def test_samples_out_of_order_are_sorted():
     np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
 
 
+def test_a_typical_step_is_the_median_of_those_that_are_some():
+    for t, step in (((0, 1, 2), 1), ((5, 5, 5, 8), 3), ((0, 1, 3, 3, 9), 2), ((4, 4), 0), ((), 0)):
+        assert tracks.typical_step_ns(np.array(t, dtype=np.int64)) == step
+
+
 @given(st.lists(st.integers(0, 12), min_size=1, max_size=12))
 def test_a_gap_is_five_times_the_median_of_the_steps_that_are_some(steps):
     t = 2 * np.cumsum([0, *steps])
