@@ -232,8 +232,8 @@ class Gate:
             self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
             self._become(Phase.DONE)
             return
-        length_s = 0.0 if self._way is None else self._way.duration_s
-        if self.phase is Phase.ENDING and self._progress_s >= length_s:
+        way = self._way
+        if self.phase is Phase.ENDING and way is not None and self._progress_s >= way.duration_s:
             self._become(Phase.DONE)
 
     def _run(self, tick: int) -> None:

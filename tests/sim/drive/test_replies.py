@@ -49,6 +49,9 @@ class Line:
         # Two rounds under way, then 1.5 intervals, at least 2 ticks; twice as long where silent.
         ((1, 3, 99), [0, 1, 3, 7, 15, 31, 63, 113, 163]),
         ((2, 6, 99), [0, 1, 4, 7, 13, 25, 49, 97, 147, 197]),
+        # Silent is the bus from the limit on.
+        ((1, 4, 99), [0, 1, 3, 7, 15, 31, 63, 113, 163]),
+        ((1, 5, 99), [0, 1, 3, 5, 9, 17, 33, 65, 115, 165]),
         # One round under way.
         ((3, 9, 99), [0, 5, 10, 20, 40, 80, 130, 180]),
         ((5, 15, 99), [0, 8, 16, 32, 64, 114, 164]),
