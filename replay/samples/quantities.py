@@ -296,9 +296,10 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
 def _looks(session: SessionView) -> list[tuple[int, int]]:
     """Half-open windows that stand for a long session [Unix ns]; none for a short one."""
     first_ns, last_ns = session.start_ns, session.end_ns
-    every_ns = STRETCH_NS * (1 + (last_ns - first_ns) // (STRETCH_NS * _LOOKS))
-    if every_ns == STRETCH_NS:
+    left_out = (last_ns - first_ns) // (STRETCH_NS * _LOOKS)
+    if not left_out:
         return []
+    every_ns = STRETCH_NS * (1 + left_out)
     later = range(first_ns + every_ns, last_ns - STRETCH_NS // 2, every_ns)
     return [(first_ns, first_ns + STRETCH_NS), *((at_ns, at_ns + _LOOK_NS) for at_ns in later)]
 

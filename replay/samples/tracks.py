@@ -269,7 +269,7 @@ def plot_step(values: FloatArray) -> float:
         return 0.0
     low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL])
     span = float(high - low) or float(known.max() - known.min())
-    return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span > 0.0 else 0.0
+    return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span else 0.0
 
 
 def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArray:
