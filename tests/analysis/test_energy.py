@@ -116,6 +116,9 @@ def test_a_window_takes_two_samples_and_a_length():
     assert integrate([power], 1.5, 2.5) == integrate([power], 2.0, 2.0) == [None]
     assert integrate([power], 3.0, 0.0) == [None]
     assert integrate([], 0.0, 1.0) == []
+    before = Series("none", np.array([0.1, 0.2]), np.ones(2))
+    nothing, same = integrate([before, power], 0.5, 2.5)
+    assert (nothing, same.net_j.tolist()) == (None, energy.net_j.tolist())
     assert add_up(power, power, 2.0, 2.0, 1) is add_up(power, power, 3.0, 1.0, 1) is None
     short = Series("q", power.t_s[:1], power.values[:1])
     assert add_up(short, short, 0.0, 4.0, 1) is None
