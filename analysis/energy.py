@@ -140,7 +140,9 @@ def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
 
 
 def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
-    known = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]) if t_ns.size else 0)
+    if not t_ns.size:
+        return t_ns.astype(np.float64)
+    known = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]))
     if known.count < 2:
         return np.full(t_ns.size, np.nan)
     t_s = (t_ns - t_ns[0]).astype(np.float64) * 1e-9

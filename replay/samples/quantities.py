@@ -7,6 +7,7 @@ little of some others are enough to choose colours, scales and the joints that s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -120,8 +121,8 @@ def power_limit(power_w: FloatArray) -> float:
         power is known or all of it is zero.
     """
     known = np.abs(power_w[np.isfinite(power_w)])
-    limit = float(np.percentile(known, 99.0)) if known.size else 0.0
-    if limit <= 0.0:
+    limit = known.size and float(np.percentile(known, 99.0))
+    if not limit:
         return 1.0
     unit = 10.0 ** (np.floor(np.log10(limit)) - 1.0)
     return float(np.ceil(limit / unit) * unit)
@@ -196,7 +197,7 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
 GAIT = "/gait"
 
 _KEPT = 4000  # samples of each line that are kept, about
-_CONTEXT_NS = (500_000_000, 60_000_000_000)
+_LEAST_CONTEXT_NS, _MOST_CONTEXT_NS = 500_000_000, 60_000_000_000
 _REACH_STEPS = 1.2 * GAP_STEPS
 
 _LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
@@ -256,11 +257,12 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     times: list[IntArray] = []
     powers: list[FloatArray] = []
     seen: dict[tuple[str, str], set[str]] = {}
-    step_ns = 0
+    context_ns = _LEAST_CONTEXT_NS
     for columns in _columns(session, wanted, looks):
         for key, tracks in columns.items():
             seen.setdefault(key, set()).update(track.name for track in tracks)
-            step_ns = max([step_ns, *(typical_step_ns(track.t_ns) for track in tracks)])
+            reaches_ns = (round(_REACH_STEPS * typical_step_ns(track.t_ns)) for track in tracks)
+            context_ns = max(context_ns, *reaches_ns)
         for entity, tracks in quantities(columns).items():
             own = lines.setdefault(entity, {})
             for track in tracks:
@@ -278,14 +280,14 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         samples={
             entity: tuple(
                 one_after_another(own[name])
-                for name in sorted(own, key=lambda name: chain.get(name, 1 << 30))
+                for name in sorted(own, key=lambda name: chain.get(name, math.inf))
             )
             for entity, own in lines.items()
         },
         parts={entity: _in_order(found, chain) for entity, found in parts.items()},
         drawing_ns=np.concatenate([np.zeros(0, dtype=np.int64), *times]),
         power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
-        context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
+        context_ns=min(context_ns, _MOST_CONTEXT_NS),
         seen=seen,
         is_whole=not looks,
     )
@@ -294,9 +296,10 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
 def _looks(session: SessionView) -> list[tuple[int, int]]:
     """Half-open windows that stand for a long session [Unix ns]; none for a short one."""
     first_ns, last_ns = session.start_ns, session.end_ns
-    every_ns = STRETCH_NS * (1 + (last_ns - first_ns) // (STRETCH_NS * _LOOKS))
-    if every_ns == STRETCH_NS:
+    left_out = (last_ns - first_ns) // (STRETCH_NS * _LOOKS)
+    if not left_out:
         return []
+    every_ns = STRETCH_NS * (1 + left_out)
     later = range(first_ns + every_ns, last_ns - STRETCH_NS // 2, every_ns)
     return [(first_ns, first_ns + STRETCH_NS), *((at_ns, at_ns + _LOOK_NS) for at_ns in later)]
 
@@ -371,5 +374,5 @@ def _in_order(
     parts: Sequence[tuple[str, ...]], chain: Mapping[str, int]
 ) -> tuple[tuple[str, ...], ...]:
     """Parts in the order of their first lines, lines in chain order."""
-    inside = [tuple(sorted(part, key=lambda name: chain.get(name, 1 << 30))) for part in parts]
-    return tuple(sorted(inside, key=lambda part: chain.get(part[0], 1 << 30)))
+    inside = [tuple(sorted(part, key=lambda name: chain.get(name, math.inf))) for part in parts]
+    return tuple(sorted(inside, key=lambda part: chain.get(part[0], math.inf)))

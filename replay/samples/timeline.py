@@ -27,7 +27,7 @@ _LEAST_STRETCHES = 200  # a session may always have so many stretches: more than
 _LEAST_MESSAGES = 100  # mean messages in a stretch, at least, where there are more
 _READ_AGAIN = 8  # how many stretches a chunk may be read for, in the mean, where there are more
 
-_FIRST_NS, _LAST_NS = -(1 << 62), 1 << 62
+_FIRST_NS, _LAST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True)

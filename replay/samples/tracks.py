@@ -269,7 +269,7 @@ def plot_step(values: FloatArray) -> float:
         return 0.0
     low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL])
     span = float(high - low) or float(known.max() - known.min())
-    return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span > 0.0 else 0.0
+    return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span else 0.0
 
 
 def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArray:
@@ -283,10 +283,12 @@ def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArr
         Shape (n, k); at most half a step from the values.
     """
     step = np.asarray(steps, dtype=np.float64)
-    if not step.any():
+    some = step > 0.0
+    if not some.any():
         return values
-    safe = np.where(step > 0.0, step, 1.0)
-    return np.where(step > 0.0, np.round(values / safe) * safe, values)
+    found = values.copy()
+    found[:, some] = np.round(values[:, some] / step[some]) * step[some]
+    return found
 
 
 GAP_STEPS = 5.0
@@ -339,7 +341,9 @@ def mark_gaps(
         Times and values with the rows put in; the arguments themselves where there is no gap.
     """
     before = np.flatnonzero(gaps(t_ns))
-    step = typical_step_ns(t_ns) if before.size or end_ns is not None else 0
+    if end_ns is None and not before.size:
+        return t_ns, values
+    step = typical_step_ns(t_ns)
     if end_ns is not None and t_ns.size and end_ns - t_ns[-1] > GAP_STEPS * step:
         before = np.append(before, t_ns.size - 1)
     if not before.size:

@@ -44,7 +44,7 @@ from itertools import compress
 import numpy as np
 
 from undulog.capture.bus.map_entry import bus_messages, frame_id
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import some_names
 from undulog.capture.log.messages.frames import (
     DIR_RX,
@@ -335,7 +335,6 @@ _MOST_PATIENCE = 50
 # Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
 # with one, a request before a reply is sent only after a time without.
 _LAGGING = {1: 2, 2: 16}
-_NS = 1e9
 
 
 @dataclass
@@ -471,7 +470,7 @@ class Confirmation:
         for sent in self._sent:
             since_s = 0.0
             if sent.confirmed_ns is not None:
-                since_s = (now_ns - sent.confirmed_ns) / _NS
+                since_s = (now_ns - sent.confirmed_ns) / NS
                 if since_s >= self._period_s:
                     continue  # the bound of the step is the narrower one from here on
             kept.append(sent)

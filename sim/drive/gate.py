@@ -88,7 +88,7 @@ class Gate:
         self.silence = Silence()
         self.held_ticks = 0
         self._silent_ticks = 0  # those of the silence that were counted by then
-        self._was_received = False  # in the tick before this one, while holding
+        self._was_received: bool  # in the tick before this one; while holding
         self._gait, self._limits, self._place = gait, limits, place
         self._listen_s = listen_s
         self._last = round(duration_s * CONTROL_RATE_HZ)
@@ -232,8 +232,8 @@ class Gate:
             self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
             self._become(Phase.DONE)
             return
-        length_s = 0.0 if self._way is None else self._way.duration_s
-        if self.phase is Phase.ENDING and self._progress_s >= length_s:
+        way = self._way
+        if self.phase is Phase.ENDING and way is not None and self._progress_s >= way.duration_s:
             self._become(Phase.DONE)
 
     def _run(self, tick: int) -> None:
@@ -284,6 +284,7 @@ class Gate:
             self._halt(self.outcome.why)
         elif fault.kind is FaultKind.SILENT:
             self.held_ticks, self._silent_ticks = self.held_ticks + 1, self.silence.ticks
+            self._was_received = False
             self._become(Phase.HOLD, "nothing is sent until a joint is received")
         else:
             self._end(clamp, status)

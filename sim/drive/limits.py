@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray, frozen
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray, frozen
 from undulog.capture.common.errors import UsageError, some_names
 from undulog.capture.robot.model import JOINT_LIMITS, OnFault, Robot, Safety
 
@@ -167,9 +167,6 @@ def gate_limits(robot: Robot) -> GateLimits:
     )
 
 
-_NS = 1e9
-
-
 class Spacing:
     """When the frames of a command may be sent.
 
@@ -209,8 +206,8 @@ class Spacing:
         before = self._sent_ns
         if len(before) != count:  # not the same frames: none of them earlier than all of those
             before = np.full(count, before.max(initial=0))
-        earliest = before + math.ceil(need_s * _NS)
-        wait_s = (int(earliest.max()) - self._now_ns()) / _NS
+        earliest = before + math.ceil(need_s * NS)
+        wait_s = (int(earliest.max()) - self._now_ns()) / NS
         if wait_s > 0.0:
             self.waits += 1
             self.longest_s = max(self.longest_s, wait_s)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture.bus.encoding import BusEncoder, BusValue, poll_frames
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.clock import REAL, Clock
 from undulog.capture.common.errors import SourceError, UndulogError
 from undulog.capture.common.process import StopRequest
@@ -72,7 +72,7 @@ class WallPace:
         self._clock = clock
         self.overruns = 0
         self.late_s = 0.0
-        self._link, self._period_ns = link, 1_000_000_000 // CONTROL_RATE_HZ
+        self._link, self._period_ns = link, NS // CONTROL_RATE_HZ
         self._tick = -1
         self._start_ns = 0
 

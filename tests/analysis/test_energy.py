@@ -93,6 +93,57 @@ def test_each_cycle_has_its_own_energy_and_coverage():
     assert energy.covered[3] == pytest.approx(0.5, abs=0.011)
 
 
+def test_powers_of_other_times_are_weighed_by_their_own():
+    t = np.arange(400) / 100
+    late = t[t >= 2.0]
+    powers = [Series(name, times, np.ones(times.size)) for name, times in (("a", t), ("b", late))]
+    powers += [powers[1], Series("c", t + 0.001, t), powers[0]]
+    together = integrate(powers, 0.0, 4.0, 2)
+    for power, energy in zip(powers, together, strict=True):
+        (alone,) = integrate([power], 0.0, 4.0, 2)
+        np.testing.assert_array_equal(energy.net_j, alone.net_j)
+        np.testing.assert_array_equal(energy.covered, alone.covered)
+        assert energy.coverage == alone.coverage
+    np.testing.assert_allclose(together[1].net_j, [0.005, 1.995], atol=0.006)
+    same = integrate([powers[0], Series("d", t, 3.0 * np.ones(400))], 0.0, 4.0, 2)
+    np.testing.assert_allclose(same[1].plus_j, 3.0 * same[0].plus_j)
+
+
+def test_a_window_takes_two_samples_and_a_length():
+    power = Series("q", np.array([1.0, 2.0, 3.0]), np.array([1.0, 1.0, -1.0]))
+    (energy,) = integrate([power], 0.5, 2.5)
+    np.testing.assert_allclose((energy.net_j, energy.plus_j), [[2.0], [2.0]])
+    assert integrate([power], 1.5, 2.5) == integrate([power], 2.0, 2.0) == [None]
+    assert integrate([power], 3.0, 0.0) == [None]
+    assert integrate([], 0.0, 1.0) == []
+    before = Series("none", np.array([0.1, 0.2]), np.ones(2))
+    nothing, same = integrate([before, power], 0.5, 2.5)
+    assert (nothing, same.net_j.tolist()) == (None, energy.net_j.tolist())
+    assert add_up(power, power, 2.0, 2.0, 1) is add_up(power, power, 3.0, 1.0, 1) is None
+    short = Series("q", power.t_s[:1], power.values[:1])
+    assert add_up(short, short, 0.0, 4.0, 1) is None
+    two = Series("q", power.t_s[:2], np.array([4.0, 6.0]))
+    np.testing.assert_allclose(add_up(two, two, 0.5, 2.5, 2).net_j, [4.0, 6.0])
+
+
+def test_a_product_of_nothing_is_nothing():
+    none = Signal("q", "A", np.zeros(0, dtype=np.int64), np.zeros(0))
+    t = np.arange(3) * 10_000_000
+    some = Signal("q", "V", t, np.ones(3))
+    assert power_of(none, some, 0).count == power_of(none, none, 0).count == 0
+    assert power_of(some, none, 0).count == 0
+
+
+def test_a_factor_is_interpolated_to_its_last_sample_and_on_either_side_of_a_gap():
+    t = np.arange(0, 300, 5) * 1_000_000 + 10**18
+    ten = np.r_[0:100:10, 200:300:10] * 1_000_000 + 10**18
+    first = Signal("q", "A", t, np.ones(t.size))
+    power = power_of(first, Signal("q", "V", ten, (ten - 10**18) * 1e-9), 10**18)
+    expected_ms = np.r_[0:91:5, 200:291:5]
+    np.testing.assert_allclose(power.t_s, expected_ms * 1e-3, atol=1e-12)
+    np.testing.assert_allclose(power.values, expected_ms * 1e-3, atol=1e-12)
+
+
 def accumulated(power, count, start_s=-3.0, length_s=0.01, fine=200):
     """Means of a power and of its positive part over intervals, by the midpoint rule."""
     at = start_s + (np.arange(count * fine).reshape(count, fine) + 0.5) * length_s / fine

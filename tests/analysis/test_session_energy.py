@@ -234,6 +234,22 @@ def test_the_result_has_each_cycle_from_the_sessions_start(written):
     assert bare.joints[0].el_coverage is None
 
 
+def test_without_a_gait_the_window_is_one_cycle(written):
+    session, columns, _ = written()
+    cycles, _ = found_in(session, columns)
+    still = dataclasses.replace(SPAN, cycles=0)
+    found, said = found_in(session, columns, span=still)
+    for name in NAMES:
+        for term in energy.TERMS:
+            (whole,) = found[name].per_cycle(term)
+            assert whole == pytest.approx(cycles[name].per_cycle(term).sum())
+    cost = energy.transport(session, angles(), cycles, SPAN, said.append)
+    result = energy.energy_result(
+        session, columns, found, still, transport=cost, closure=None, warn=said.append
+    )
+    assert (result.start_s, result.stop_s, said) == ((1.0,), (9.0,), [])
+
+
 def test_the_ledger_is_compared_over_the_same_window(written):
     session, columns, _ = written()
     found, _ = found_in(session, columns)

@@ -64,6 +64,7 @@ def test_a_total_is_at_the_first_ones_times_and_unknown_where_one_is():
         (np.r_[np.full(1000, -0.123), 50.0, np.nan], 0.13),  # rounded up to two digits
         (np.full(3, 1234.0), 1300.0),
         (np.zeros(4), 1.0),
+        (np.r_[np.zeros(999), 5.0], 1.0),  # nearly all of it
         (np.full(2, np.nan), 1.0),
     ],
 )
@@ -195,6 +196,8 @@ def test_a_survey_keeps_lines_in_chain_order_and_thins_the_times(opened, snake):
     assert found.context_ns == 500_000_000  # 1.2 x 5 steps of 10 ms are less than the least
     slow = opened(("/joint_states", names, t[::40], t[::40], *fields), robot=snake)
     assert quantities.survey(slow, 10.0).context_ns == pytest.approx(6 * 400_000_000)
+    rare = opened(("/joint_states", names, 12.0 * t[:20] * 100, t[:20], *fields), robot=snake)
+    assert quantities.survey(rare, 10.0).context_ns == 60_000_000_000  # a minute at most
 
 
 def test_the_power_of_all_links_sets_the_colour(opened, snake):
@@ -247,8 +250,16 @@ def test_stretches_are_as_long_as_they_have_to_be(opened):
     starts = [session.start_ns + k * STRETCH_NS for k in range(1, 5)]
     assert [one.start_ns for one in spans[1:]] == starts == [one.stop_ns for one in spans[:-1]]
     assert [one.known_ns for one in spans] == [*(at + NS for at in starts), None]
+    read = timeline.stretches(session, {"/joint_states": ["position"]}, NS)
+    for k, one in enumerate(read):
+        (line,) = one.columns["/joint_states", "position"]
+        seen = t[(t >= 40 * k - (k > 0)) & (t < 40 * (k + 1) + (k < 4))]  # a second about it
+        np.testing.assert_array_equal(line.t_ns - session.start_ns, np.round(seen * NS))
     assert spans[0].start_ns < 0
     assert spans[-1].stop_ns > 1 << 61
+    brief = opened(("/joint_states", ("a",), t[:6], t[:6]))
+    (whole,) = timeline.stretches(brief, {"/joint_states": ["position"]}, NS)
+    assert whole.span == timeline.Span()
     # A clock that jumps a year: a million stretches would be empty.
     year = opened(("/joint_states", ("a",), np.append(t, 3.2e7), np.append(t, 1.0)))
     length_ns = stretch_length_ns(year)
@@ -301,6 +312,16 @@ def test_a_map_names_its_range():
     table = dataclasses.replace(table, quantity=content.ENERGY)
     other = content.HeatMap(table, (1,), 0.25, 1.5, signed=False)
     assert other.title == "Net energy map, 0.25 to 1.50 J/cycle"
+
+
+def test_content_begins_with_nothing():
+    empty = content.Content(None)
+    assert not any(vars(empty).values())
+    assert {type(value) for value in vars(empty).values()} == {type(None), tuple, bool, int}
+    assert content.Layer(None) == content.Layer(None, None, (), ())
+    for red, green, blue, opacity in (content.GREY, content.NAMED):
+        assert (min(red, green, blue) >= 0, opacity) == (True, 255)
+    assert len(set(content.GREY[:3])) == 1
 
 
 def test_titles_of_signals_are_short_and_others_keep_their_names():

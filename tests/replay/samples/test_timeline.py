@@ -1,9 +1,20 @@
 """Time columns against the phases and times they stand for."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from undulog.replay.samples.timeline import GAIT_CYCLE, ROWS_PER_CHUNK, SESSION_TIME, Clock, Rhythm
+from undulog.replay.samples.timeline import (
+    GAIT_CYCLE,
+    ROWS_PER_CHUNK,
+    SESSION_TIME,
+    STRETCH_NS,
+    Clock,
+    Rhythm,
+    Span,
+    stretch_length_ns,
+)
 
 MS = 1_000_000
 T = np.arange(400, dtype=np.int64) * 10 * MS
@@ -58,3 +69,64 @@ def test_rows_without_a_phase_are_on_session_time_only():
 
 def test_no_rows_make_no_chunks():
     assert list(Clock(0).rows(T[:0])) == []
+
+
+def test_rows_with_and_without_a_phase_are_chunks_of_their_own():
+    t = np.arange(3 * ROWS_PER_CHUNK, dtype=np.int64)
+    first, last = ROWS_PER_CHUNK + 5, 2 * ROWS_PER_CHUNK + 9
+    rhythm = Rhythm(t[first : last + 1], t[first : last + 1] / 1e9)
+    chunks = [(rows.start, rows.stop, len(columns)) for rows, columns in Clock(0, rhythm).rows(t)]
+    assert chunks == [
+        (0, ROWS_PER_CHUNK, 1),
+        (ROWS_PER_CHUNK, first, 1),
+        (first, first + ROWS_PER_CHUNK, 2),
+        (first + ROWS_PER_CHUNK, last + 1, 2),
+        (last + 1, 3 * ROWS_PER_CHUNK, 1),
+    ]
+
+
+def test_a_cycle_is_rounded_to_its_nanosecond():
+    t = np.arange(4, dtype=np.int64)
+    found = gathered(Clock(0, Rhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
+    assert list(found[GAIT_CYCLE].values()) == [0, 2, 2, 250_000_000]
+
+
+def test_a_span_without_bounds_holds_every_time():
+    t_ns = np.array([-(1 << 62), 0, (1 << 62) - 1], dtype=np.int64)
+    assert Span().rows(t_ns) == slice(0, 3)
+    assert Span(stop_ns=0).rows(t_ns) == slice(0, 1)
+    assert Span(start_ns=0).rows(t_ns) == slice(1, 3)
+    assert Span().known_ns is None
+
+
+def session_of(count, messages=0, first=(), last=()):
+    """A session so many stretches long, with chunks from and to some times, in stretches."""
+    times = (np.array([STRETCH_NS * k for k in ends], dtype=np.uint64) for ends in (first, last))
+    channels = {"a": SimpleNamespace(count=messages), "b": SimpleNamespace(count=0)}
+    return SimpleNamespace(
+        start_ns=7, end_ns=7 + count * STRETCH_NS, channels=channels, chunk_times_ns=tuple(times)
+    )
+
+
+@pytest.mark.parametrize(
+    ("session", "doubled"),
+    [
+        (session_of(200), 0),
+        (session_of(201), 1),
+        (session_of(403), 2),  # 403, 201.5 and 100.75 stretches
+        (session_of(300, 30_000), 0),
+        (session_of(301, 30_000), 1),
+        (session_of(300, 29_999), 1),
+        # A chunk is read for eight stretches in the mean, and for 200 more in all.
+        (session_of(150, 0, [0], [207]), 0),
+        (session_of(150, 0, [0], [208]), 1),
+        (session_of(150, 0, [208], [0]), 0),  # of a damaged index
+        (session_of(150, 0, [0, 10], [107, 117]), 0),
+        (session_of(150, 0, [0, 10], [107, 118]), 1),
+        (session_of(150, 0, [100, 10], [108, 216]), 0),
+        (session_of(1, 0, [0], [5000]), 0),
+        (session_of(2, 0, [0], [5000]), 1),
+    ],
+)
+def test_stretches_are_longer_where_shorter_ones_would_be_laborious(session, doubled):
+    assert stretch_length_ns(session) == STRETCH_NS * 2**doubled

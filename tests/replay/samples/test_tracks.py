@@ -1,5 +1,6 @@
 """Joint samples: tables of common times, resampling against closed forms, and rounding."""
 
+import itertools
 import statistics
 
 import numpy as np
@@ -72,6 +73,22 @@ def test_joints_in_turn_have_one_sample_between_two_of_the_first():
     assert not tracks.in_turn(t, t[::2] + 3)
     assert not tracks.in_turn(t, np.sort(np.concatenate([t + 3, t + 6])))
     assert not tracks.in_turn(t, t[:0])
+
+
+increasing = st.lists(st.integers(1, 6), min_size=1, max_size=8).map(np.cumsum)
+
+
+@given(increasing, increasing, st.integers(-8, 8))
+def test_turns_are_one_between_any_two_of_the_first_but_at_an_end(first, other, shift):
+    other = other + shift
+    counts = [np.sum((other >= a) & (other < b)) for a, b in itertools.pairwise(first)]
+    taken = np.flatnonzero(counts)
+    expected = (
+        len(taken) >= max(len(first) - 2, 1)
+        and np.ptp(taken) == len(taken) - 1
+        and max(counts) == 1
+    )
+    assert tracks.in_turn(first.astype(np.int64), other.astype(np.int64)) == expected
 
 
 def test_joints_in_turn_are_brought_to_the_first_ones_times():
@@ -171,6 +188,15 @@ def test_silence_before_the_end_is_a_gap():
     assert all(one is given for one, given in zip(whole, (t, values), strict=True))
 
 
+@given(st.lists(st.integers(0, 9), max_size=8))
+def test_any_order_becomes_that_of_a_stable_sort(times):
+    t, values = np.array(times, dtype=np.int64), np.arange(float(len(times)))
+    found = tracks.ordered(t, values)
+    order = sorted(range(len(times)), key=times.__getitem__)
+    np.testing.assert_array_equal(found[0], t[order])
+    np.testing.assert_array_equal(found[1], values[order])
+
+
 def test_samples_out_of_order_are_sorted():
     t, values = tracks.ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
     np.testing.assert_array_equal(t, ticks(0, 10, 20))
@@ -179,6 +205,11 @@ def test_samples_out_of_order_are_sorted():
     assert tracks.ordered(t, np.zeros(4))[0] is t
     _, values = tracks.ordered(ticks(10, 10, 0), np.array([1.0, 2.0, 0.0]))
     np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
+
+
+def test_a_typical_step_is_the_median_of_those_that_are_some():
+    for t, step in (((0, 1, 2), 1), ((5, 5, 5, 8), 3), ((0, 1, 3, 3, 9), 2), ((4, 4), 0), ((), 0)):
+        assert tracks.typical_step_ns(np.array(t, dtype=np.int64)) == step
 
 
 @given(st.lists(st.integers(0, 12), min_size=1, max_size=12))

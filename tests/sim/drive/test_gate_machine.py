@@ -5,100 +5,21 @@ import dataclasses
 import numpy as np
 import pytest
 
+from support.gate_bench import COUNT, LIMITS, RATE_HZ, ROBOT, Bench, Wave, fastest, reading
 from undulog.capture import load_robot
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import DIR_TX, ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import OnFault
 from undulog.capture.sources.events import BUS_OFF
 from undulog.sim.drive.feedback import BusCheck
-from undulog.sim.drive.gate import HOLD_S, POSE_S, Gate
-from undulog.sim.drive.limits import gate_limits
+from undulog.sim.drive.gate import HOLD_S, POSE_S
 from undulog.sim.drive.outcome import (
     DriveEnding,
     FaultKind,
     GateFault,
-    GateInput,
-    JointStatus,
     Phase,
     jitter,
 )
-from undulog.sim.gait.contract import GaitTick, Readings
-
-ROBOT = load_robot("snake25")
-LIMITS = gate_limits(ROBOT)
-COUNT = 25
-RATE_HZ = 100
-
-
-def fastest(commands):
-    """Return the largest change of a command from tick to tick [rad]."""
-    return np.abs(np.diff(commands, axis=0)).max()
-
-
-class Wave:
-    """A gait: joint i follows amplitude sin(w t + i), from the first tick on."""
-
-    names = ()
-
-    def __init__(self, amplitude=0.3, frequency_hz=0.5):
-        self.amplitude, self.w = amplitude, 2 * np.pi * frequency_hz
-        self.asked = []
-
-    def at(self, time_s):
-        return self.amplitude * np.sin(self.w * time_s + np.arange(COUNT))
-
-    def step(self, time_s, readings):
-        del readings
-        self.asked.append(time_s)
-        return GaitTick(self.at(time_s), np.empty(0), "walk", ())
-
-
-def reading(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0, **more):
-    def all_of(value):
-        return np.broadcast_to(np.asarray(value, dtype=float), COUNT).copy()
-
-    status = JointStatus(
-        all_of(angle), all_of(current), all_of(temperature), all_of(voltage), all_of(silence_s)
-    )
-    return GateInput(Readings(status.angle, all_of(0.0)), status, **more)
-
-
-class Bench:
-    """A gate with a robot that is where it was commanded to be one tick before."""
-
-    def __init__(self, gait=None, start=0.0, *, duration_s=1.0, limits=LIMITS, **options):
-        self.gait = gait or Wave()
-        options |= {"duration_s": duration_s, "place": "can:test"}
-        self.gate = Gate(self.gait, limits, **options)
-        self.angle = np.full(COUNT, start)
-        self.tick = 0
-        self.sent = []
-
-    def step(self, change=None, stop="", *, at_once=False, skip=0, **more):
-        angle = self.angle.copy()
-        if change is not None:
-            change(angle)
-        self.tick += skip
-        found = self.gate.step(self.tick, reading(angle, **more), stop, at_once=at_once)
-        self.tick += 1
-        if found.command is not None:
-            self.sent.append(found.command)
-            self.angle = found.command
-        return found
-
-    def until(self, phase, **more):
-        for _ in range(2000):
-            found = self.step(**more)
-            if self.gate.phase is phase:
-                return found
-        raise AssertionError(f"never came to {phase}")
-
-    def running(self, ticks=0):
-        """Run the gait, so many ticks of it."""
-        self.until(Phase.RUN)
-        for _ in range(ticks):
-            self.step()
-        return self
 
 
 def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():

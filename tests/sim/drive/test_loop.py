@@ -95,13 +95,13 @@ class Bus:
 
 
 class Drive:
-    """A drive of 2 s; ``late`` has how long a tick takes, by its number [s]."""
+    """A drive of 1 s; ``late`` has how long a tick takes, by its number [s]."""
 
     def __init__(self, *, late_s=(), late=None, delay_s=0.0, stopped=()):
         time = SimulatedClock()
         self.bus = Bus(time, delay_s)
         self.bus.stopped = [(time.now_ns + a * NS, time.now_ns + b * NS) for a, b in stopped]
-        self.gate = Gate(Wave(), LIMITS, duration_s=2.0, place="can:simulated", listen_s=0.5)
+        self.gate = Gate(Wave(), LIMITS, duration_s=1.0, place="can:simulated", listen_s=0.5)
         now_ns = time.clock.monotonic_ns
         self.loop = ControlLoop(
             self.gate,
@@ -141,7 +141,7 @@ def test_on_time_it_is_complete_and_no_tick_is_left_out():
     assert drive.outcome.how is DriveEnding.COMPLETE
     assert drive.loop.tally.overruns == 0
     assert max(drive.loop.tally.late_s) == 0.0
-    assert drive.gate.run_s == 2.0
+    assert drive.gate.run_s == 1.0
 
 
 @settings(max_examples=3, deadline=None)
