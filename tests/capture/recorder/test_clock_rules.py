@@ -31,7 +31,7 @@ def test_a_rate_is_known_after_two_seconds():
     assert steady(21)[0].result().drift_ppm == 0.0
 
 
-# -- what is reported of the delays -----------------------------------------------------------------
+# -- what is reported of the delays ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [700, 9000])
