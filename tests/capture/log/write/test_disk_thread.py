@@ -134,7 +134,7 @@ def test_parts_are_finished_in_order_and_the_next_has_the_hash_of_the_last(stage
             assert records["undulog.part"] == {"previous_sha256": former}
 
 
-def test_a_busy_thread_syncs_every_32_mib(stage):
+def test_a_busy_thread_syncs_after_more_than_32_mib(stage):
     begin, mib = threading.Event(), bytes(1 << 20)
     part, put = stage.part, stage.part.put
 
@@ -144,12 +144,12 @@ def test_a_busy_thread_syncs_every_32_mib(stage):
         return len(data)
 
     part.put = waiting
-    for _ in range(70):
-        write(stage, mib)
+    for piece in [*[mib] * 32, b"x", *[mib] * 32, b"x", mib]:
+        write(stage, piece)
     begin.set()
-    ended(stage, 70 << 20)
+    ended(stage, (65 << 20) + 2)
     part.put = put
-    assert [taken >> 20 for taken in part.syncs] == [33, 66, 70]
+    assert part.syncs == [(32 << 20) + 1, (64 << 20) + 2, (65 << 20) + 2]
 
 
 # -- a disk that refuses ---------------------------------------------------------------------------

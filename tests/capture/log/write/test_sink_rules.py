@@ -10,6 +10,7 @@ import pytest
 from mcap.records import Metadata
 
 from support import durable_child as recorder
+from support.processes import wait_for
 from support.read_back import metadata_of, read
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.write import durable_sink
@@ -194,6 +195,22 @@ def test_a_part_that_the_log_can_not_note_is_not_begun(tmp_path, now, monkeypatc
         monkeypatch.undo()
         assert sink.part == 1
         assert not list(tmp_path.glob("run_0002*"))
+
+
+def test_the_log_is_released_up_to_what_the_file_has(tmp_path, now):
+    """Over the parts: positions are counted from the first one."""
+    with closing(tmp_path / "run.mcap") as sink:
+        for number in range(40):
+            if number == 20:
+                sink.split()
+            recorder.write(sink, number)
+            if number in (9, 29):
+                now[0] += 5.0
+                sink.tick()
+        wait_for(lambda: sink._wal._released == 20, "the end of the first part")
+        now[0] += 5.0
+        sink.tick()
+        wait_for(lambda: sink._wal._released == 40, "all, which are in one chunk")
 
 
 # -- troubles --------------------------------------------------------------------------------------
