@@ -1,6 +1,5 @@
 """One bus of a recording: which source is the robot's, and how its frames are written."""
 
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -192,9 +191,7 @@ def work(monkeypatch):
             work.now_ns += work.costs[0] if len(work.costs) == 1 else work.costs.pop(0)
         return work.now_ns
 
-    monkeypatch.setattr(
-        bus_recorder, "time", SimpleNamespace(thread_time_ns=thread_time_ns, sleep=time.sleep)
-    )
+    monkeypatch.setattr(bus_recorder, "time", SimpleNamespace(thread_time_ns=thread_time_ns))
     return work
 
 
