@@ -2,10 +2,12 @@
 
 import errno
 import os
+import signal
 from types import SimpleNamespace
 
 import pytest
 
+from support.processes import python
 from support.wal_messages import CHANNEL
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.log.wal import segment as segments
@@ -138,6 +140,19 @@ def test_a_cut_within_a_page_that_is_not_full_is_survived(tmp_path):
     assert made.cut
     assert not made.put((3, 5, MARK, 1, 0, 0, 0), b"")
     made.close(remove=True)
+
+
+SENT = """
+import os, signal, sys
+from undulog.capture.log.wal.writer import WriteAheadLog
+wal = WriteAheadLog(sys.argv[1])
+os.kill(os.getpid(), signal.SIGBUS)
+print("goes on")
+"""
+
+
+def test_a_signal_that_no_cut_file_raised_ends_the_process(tmp_path):
+    assert python(SENT, tmp_path / "w", code=-signal.SIGBUS).stdout == ""
 
 
 def test_a_segment_that_ends_leaves_no_file_open(tmp_path):
