@@ -145,7 +145,7 @@ def test_syncing_and_publishing_leave_no_file_open(tmp_path):
     with pytest.raises(OSError, match="symbolic links"):
         publish_durably(link, output, replace=True)
     assert output.read_text() == "True"
-    assert descriptors() == before
+    assert descriptors() <= before
 
 
 # -- without renameat2 -----------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_a_name_that_is_taken_is_followed_by_a_random_one(tmp_path):
     with claimed_part(tmp_path / "b") as part:
         assert part == tmp_path / "b.part"
         assert part.stat().st_mode & 0o777 == 0o666 & ~umask()
-    assert descriptors() == before
+    assert descriptors() <= before
 
 
 def umask():
@@ -268,7 +268,7 @@ def test_a_new_file_that_another_process_took_for_an_abandoned_one_is_left_to_it
     with claimed_part(tmp_path / "a") as part:
         assert names(tmp_path) == sorted(["a.part", part.name])
         assert re.fullmatch(r"a\.[0-9a-f]{8}\.part", part.name)
-    assert descriptors() == before + 1
+    assert descriptors() <= before + 1
     os.close(holders[0])
 
 

@@ -164,7 +164,7 @@ def test_a_segment_that_ends_leaves_no_file_open(tmp_path):
         made.close(remove=remove)
         assert path.exists() is not remove
         assert not made.put((2, 5, MARK, 1, 0, 0, 0), b"")
-    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
+    assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208
 
 
 @pytest.mark.parametrize("at", range(2))
@@ -231,7 +231,7 @@ def test_a_segment_that_can_not_be_reserved_leaves_no_file(tmp_path, monkeypatch
         Segment(tmp_path / "000001.seg", header(PAGE))
     assert str(caught.value).startswith(f"{tmp_path / '000001.seg'}: {why}")
     assert list(tmp_path.iterdir()) == []
-    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
+    assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208
 
 
 def test_reserved_space_is_a_file_that_is_freed_once(tmp_path):

@@ -179,7 +179,7 @@ def test_a_folder_without_locks_is_an_error_and_never_live(tmp_path, monkeypatch
     with pytest.raises(errors.LogWriteError, match=text):
         WalLock(tmp_path)
     assert is_live(tmp_path) is (number == 11)
-    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
+    assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208
     lock.release()
 
 
