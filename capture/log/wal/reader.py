@@ -205,6 +205,7 @@ class Recovery(Iterator[WalMessage]):
         last = 0
         try:
             for segment in segments:
+                reader = None
                 try:
                     reader = _SegmentReader(segment, segment.path.open("rb"), last)
                     for head, payload in reader.records():
@@ -219,7 +220,7 @@ class Recovery(Iterator[WalMessage]):
                 except OSError as error:
                     text = f"{segment.path.name} can't be read to its end: {error.strerror}"
                     self.warnings.append(text)
-                    reader = _closed(reader)
+                    _closed(reader)
                     continue
                 _closed(former)
                 former = reader
@@ -291,8 +292,6 @@ class _SegmentReader:
         The CRC is computed in pieces, so that a wrong length allocates no memory.
         """
         left = self._end - at - RECORD_SIZE
-        if left < 0:
-            return None
         self._file.seek(at)
         raw = self._file.read(RECORD_SIZE)
         if len(raw) < RECORD_SIZE:

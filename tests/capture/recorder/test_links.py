@@ -7,8 +7,9 @@ import signal
 
 import pytest
 
+from support import recorders
 from support.processes import run, undulog, wait_for
-from support.recorders import command, connected_sender, ended, events, recording
+from support.recorders import connected_sender, ended, events, recording
 from support.written_frames import frames_of
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.recorder.links import SourceLink, link_faults
@@ -56,7 +57,7 @@ def test_a_device_that_is_not_there_is_exit_code_1_with_the_reason(
     address, reason, output, tmp_path
 ):
     words = (address.format(tmp_path), "--duration", "0.5s", "--floor", "0", "--json")
-    done = run(*command(output, *words), code=1)
+    done = run(*recorders.command(output, *words), code=1)
     fault = f"source can0 was never connected: {reason.format(tmp_path)}"
     assert done.stderr.splitlines()[-1] == f"error: 0.5 s are over; {fault}"
     report = json.loads(done.stdout)
@@ -100,10 +101,10 @@ def test_a_device_that_comes_late_is_no_fault(output, tmp_path):
     assert (process.returncode, report["failed"]) == (0, False)
 
 
-def test_a_request_to_stop_reports_that_the_robot_never_came(output, tmp_path):
+def test_a_request_to_stop_reports_that_the_robot_never_came(output, tmp_path, command):
     with recording(output, f"can0=unix:{tmp_path}/can0.sock") as process:
         words = ("record", "stop", "--wait", "--socket", output.with_name("control.sock"))
-        done = undulog(*words, code=1)
+        text = command(*words, code=1).out
         ended(process)
-    assert "it was stopped; source can0 was never connected" in done.stdout
+    assert "it was stopped; source can0 was never connected" in text
     assert process.returncode == 1

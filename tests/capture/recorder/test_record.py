@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support import recorders
 from support.paths import ROOT
 from support.processes import run, wait_for
-from support.recorders import command, connected_sender, ended, events, polling, recording, send
+from support.recorders import connected_sender, ended, events, polling, recording, send
 from support.written_frames import frames_of
 from undulog.capture import Session
 from undulog.capture.common.process import StopRequest
@@ -99,7 +100,7 @@ def test_unknown_identifiers_and_losses_are_reported_and_the_verdict_is_that_of_
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     options = ("--fast", "--duration", "4s", "--json", "--floor", "0")
-    report = json.loads(run(*command(output, "twin:flat"), *options, cwd=ROOT).stdout)
+    report = json.loads(run(*recorders.command(output, "twin:flat"), *options, cwd=ROOT).stdout)
     assert (report["robot"], report["ended"]) == ("snake25", "all sources have ended")
     with Session.open(output) as session:
         states = session.joints("/joint_states")
@@ -111,7 +112,14 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
 # -- the end ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        signal.SIGTERM,
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_leaves_a_whole_file(number, tmp_path, output, bus):
     with recording(output, f"unix:{bus}") as process, connected_sender(bus):
         report, err = ended(process, number)
@@ -152,12 +160,14 @@ def test_a_mistake_in_what_looks_on_does_not_end_the_recording(output, bus, monk
     ],
     ids=["a source that can never work", "an existing output", "no space to begin with"],
 )
-def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, fault, tmp_path):
+def test_what_can_not_be_recorded_leaves_no_file(
+    existing, floor, code, fault, *, tmp_path, command
+):
     output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
     if existing is not None:
         (tmp_path / existing).write_text("precious")
-    done = run(*command(output, f"unix:{bus}"), "--floor", floor, cwd=ROOT, code=code)
-    assert fault in done.stderr
+    words = (f"unix:{bus}", "-o", output, "--socket", tmp_path / "control.sock", "--floor", floor)
+    assert fault in command("record", *words, code=code).err
     left = {path.name: path.read_text() for path in tmp_path.iterdir()}
     assert left == ({} if existing is None else {existing: "precious"})
 
@@ -173,8 +183,9 @@ def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, fault, t
         (["unix:/tmp/a.sock", "--split-size", "many"], "--split-size"),
     ],
 )
-def test_wrong_usage_is_reported_before_anything_is_made(arguments, fault, tmp_path):
-    assert fault in run(*command(tmp_path / "run.mcap", *arguments), cwd=ROOT, code=2).stderr
+def test_wrong_usage_is_reported_before_anything_is_made(arguments, fault, tmp_path, command):
+    output = ("-o", tmp_path / "run.mcap", "--socket", tmp_path / "control.sock")
+    assert fault in command("record", *arguments, *output, code=2).err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from support import processes
 from support.processes import UNDULOG, python, wait_for
-from support.processes import undulog as undulog_command
 from support.read_back import decoded_of
 from support.recorders import connected_sender, sockets_of
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
@@ -124,13 +123,13 @@ def test_a_recorder_that_is_killed_while_we_wait_is_reported(recorder):
     assert "run.sock: " in err
 
 
-def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorder, place):
+def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorder, place, ask):
     recorder("run")
     (place / "b").mkdir()
     socket = place / "r" / "undulog" / "run.sock"
     words = (f"unix:{place}/b.frames", "-o", place / "b" / "run.mcap", "--socket", socket)
-    done = undulog_command("record", *words, code=1)
-    assert "another recorder listens there; end it, or name another with --socket" in done.stderr
+    fault = "another recorder listens there; end it, or name another with --socket"
+    assert fault in ask(*words, code=1).err
     assert list((place / "b").iterdir()) == []
     with ControlClient(socket) as client:
         assert client.ask({"do": "status"})["output"] == f"{place}/run.mcap"

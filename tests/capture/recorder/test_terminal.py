@@ -12,7 +12,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
@@ -154,7 +154,6 @@ texts = st.text(max_size=200)
 
 
 @given(st.integers(40, 200), st.integers(8, 60), texts, texts, texts)
-@settings(max_examples=60, deadline=None)
 def test_no_screen_is_wider_than_the_terminal_whatever_names_say(width, height, reason, path, said):
     snapshot = replace(
         SNAPSHOT,

@@ -1,6 +1,5 @@
 """A recording that waits for its first command: a real virtual robot, and a silent line."""
 
-import json
 import os
 import pty
 import signal
@@ -10,7 +9,7 @@ import pytest
 
 from support.paths import ROOT
 from support.processes import serving, undulog, wait_for
-from support.recorders import ended, polling, recording, send
+from support.recorders import ended, polling, recording, send, status_of
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import DIR_TX
 
@@ -18,12 +17,7 @@ from undulog.capture.log.messages.frames import DIR_TX
 @pytest.fixture
 def status(tmp_path):
     """Returns the status of the only recorder of the folder."""
-
-    def ask():
-        words = ("record", "status", "--json", "--socket", tmp_path / "control.sock")
-        return json.loads(undulog(*words, code=0).stdout)["recordings"][0]
-
-    return ask
+    return lambda: status_of(tmp_path / "run.mcap")
 
 
 WAITING = "waiting for commands"
