@@ -151,29 +151,15 @@ def pytest_collection_modifyitems(config, items):
     items[:] = [item for item in items if item not in left_out]
 
 
-LONG_S = 0.2
-"""A test that records takes longer; to count exempt objects takes milliseconds."""
-_began_s = 0.0
-
-
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish():
-    """Exempt what was imported from garbage collection: a full one takes a quarter of a second."""
+    """Exempt what was imported from garbage collection: a full one takes a quarter of a second.
+
+    A recording exempts all that is there, and at its end nothing; here that stays exempt.
+    """
     gc.collect()
     gc.freeze()
-
-
-def pytest_runtest_logstart():
-    """Note when a test begins."""
-    global _began_s  # noqa: PLW0603
-    _began_s = time.monotonic()
-
-
-def pytest_runtest_logfinish():
-    """Exempt it again after a recording, whose end makes all objects subject to collection."""
-    if time.monotonic() - _began_s > LONG_S and not gc.get_freeze_count():
-        gc.collect()
-        gc.freeze()
+    gc.unfreeze = lambda: None
 
 
 @pytest.hookimpl(trylast=True)

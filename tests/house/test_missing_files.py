@@ -83,8 +83,17 @@ def there(tmp_path_factory):
     return {"run": folder / "run.mcap", "csv": folder / "a.csv"}
 
 
-@pytest.mark.parametrize("kind", ["empty", "several", "rosbag2", "rosbag2 of sqlite3"])
-@pytest.mark.parametrize("line", LINES)
+KINDS = ["empty", "several", "rosbag2", "rosbag2 of sqlite3"]
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"),
+    [
+        pytest.param(line, kind, marks=() if (n + m) % len(KINDS) == 0 else pytest.mark.nightly)
+        for n, line in enumerate(LINES)
+        for m, kind in enumerate(KINDS)
+    ],
+)
 def test_a_folder_that_is_no_session_is_named_with_the_fix(line, kind, there, tmp_path, capsys):
     folder = tmp_path / "folder"
     folder.mkdir()

@@ -33,7 +33,7 @@ def whole(tmp_path_factory):
 def test_whatever_stands_there_it_is_a_result_or_a_sentence(other, whole, tmp_path):
     path, refused = tmp_path / "x.json", 0
     found = [one for one in places(whole) if one]
-    for place in found[:: max(1, len(found) // 30)]:
+    for place in found[:: max(1, len(found) // 15)]:
         data = json.loads(json.dumps(whole))
         node = data
         for key in place[:-1]:
@@ -47,7 +47,7 @@ def test_whatever_stands_there_it_is_a_result_or_a_sentence(other, whole, tmp_pa
             said = str(error)
         assert not said or str(path) in said, place
         refused += bool(said)
-    assert refused > 10
+    assert refused > 5
 
 
 def test_a_text_is_no_list_of_letters(tmp_path):
