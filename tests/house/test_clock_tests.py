@@ -146,6 +146,7 @@ load.communicate("\\n")
 """
 
 
+@pytest.mark.slow
 def test_processor_times_are_told_apart_by_who_began_the_processes(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"))
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -69,8 +69,8 @@ DAMAGES = {
 }
 
 
-FAST = {("flipped", "sessions"), ("empty", "analyses")}
-SLOW = {("cut", "joints"), ("folder", "sources")}
+FAST = {("empty", "analyses")}
+SLOW = {("flipped", "sessions"), ("cut", "joints"), ("folder", "sources")}
 
 
 def when(damage, kind):

@@ -101,7 +101,11 @@ def test_a_shift_of_the_shared_parameters_is_absorbed(curvature, dof):
 
 
 @pytest.mark.parametrize(
-    "module", [3, *(pytest.param(k, marks=pytest.mark.nightly) for k in (0, 2, 6))]
+    "module",
+    [
+        pytest.param(3, marks=pytest.mark.slow),
+        *(pytest.param(k, marks=pytest.mark.nightly) for k in (0, 2, 6)),
+    ],
 )
 def test_a_weak_module_is_found_and_named(module):
     """Also the middle one, to which a reversal is blind."""

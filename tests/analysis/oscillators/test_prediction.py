@@ -96,7 +96,9 @@ def rates_of(H, c):
     return EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
 
 
-@pytest.mark.parametrize("draws", [8, pytest.param(20, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "draws", [pytest.param(8, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.nightly)]
+)
 def test_intervals_of_rates_hold_under_scatter(draws):
     J = rates_of(*kick_tables.chain(5)) / EPS
     truth = EPS * np.sort(np.linalg.eigvals(of_deviations(np.eye(5) + J)).real)

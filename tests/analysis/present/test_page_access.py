@@ -12,7 +12,11 @@ import pytest
 from undulog.analysis.present.page import render
 from undulog.analysis.results.coupling import Coupling
 
-PAGES = ["snake", "still", "single", "hostile", "both_ways", "kicked", "swept"]
+PAGES = [
+    *("snake", "hostile"),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("both_ways", "kicked", "swept")),
+    *(pytest.param(name, marks=pytest.mark.nightly) for name in ("still", "single")),
+]
 
 
 @pytest.fixture(scope="module", params=PAGES)

@@ -15,7 +15,7 @@ SCENARIO = f"""
 name = "changed"
 settle_s = 2.0
 gait.ramp_s = 1.0
-{SNAKE13.replace("2.0", "7.0").replace("hz = 0.5", "hz = 1.0")}
+{SNAKE13.replace("2.0", "5.0").replace("hz = 0.5", "hz = 1.0")}
 [world]
 heading = 0.4
 [world.ground]
