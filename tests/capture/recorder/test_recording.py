@@ -185,6 +185,15 @@ def test_what_was_recorded_is_reported(stage):
     assert ("x", "beware") in events(stage.output)
 
 
+def test_pauses_are_counted_and_their_times_added(stage):
+    source = Source()
+    made = stage.recording(source, duration=10.0)
+    source.acts = {50: lambda: stage.time.pass_s(2.0), 150: lambda: stage.time.pass_s(1.5)}
+    facts = made.run().recorder
+    assert facts["pauses"] == "2"
+    assert float(facts["paused_s"]) == pytest.approx(2.0 + 1.5, abs=2 * 0.02)
+
+
 def test_a_stop_is_a_good_end(stage):
     source = Source()
     made = stage.recording(source)
