@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import signal
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +14,7 @@ from support.recorders import connected_sender, ended, events, recording
 from support.written_frames import frames_of
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.recorder.links import SourceLink, link_faults
+from undulog.capture.sources.contract import Polled, SourceCounts, SourceEvent
 
 
 @pytest.fixture
@@ -34,6 +36,19 @@ def test_only_a_source_that_was_never_connected_is_a_fault():
         "source e was never connected: no attempt to connect has ended",
     )
     assert link_faults({}) == ()
+
+
+@pytest.mark.parametrize("connected", [False, True])
+@pytest.mark.parametrize("frames", [0, 7])
+def test_who_was_connected_at_a_poll_or_gave_a_frame_was_there(connected, frames):
+    source = SimpleNamespace(connected=connected, counts=SourceCounts(frames=frames))
+    link = SourceLink(listens=True)
+    link.note(source, Polled())
+    assert link.ever_connected == (connected or frames > 0)
+    source.connected, source.counts.frames = False, 0
+    link.note(source, Polled(events=(SourceEvent(0, "info", "is gone"),)))
+    assert link.ever_connected == (connected or frames > 0)
+    assert (link.latest, link.lost) == ("is gone", False)
 
 
 @pytest.mark.slow
