@@ -131,7 +131,7 @@ class Recovery(Iterator[WalMessage]):
             elif opened is not None:
                 found.append(opened)
         if not found:
-            reasons = "; ".join(self.warnings) or "all segments vanished while they were read"
+            reasons = "; ".join(self.warnings) or "its segments were made or removed meanwhile"
             raise NotALogError(self.folder, reasons)
         return found
 
@@ -140,13 +140,17 @@ class Recovery(Iterator[WalMessage]):
             check_regular(path)
             with path.open("rb") as file:
                 size = file.seek(0, os.SEEK_END)
+                blank = True
                 for at in (0, max(0, size - HEADER_SIZE)):
                     file.seek(at)
-                    header = SegmentHeader.unpack(file.read(HEADER_SIZE))
+                    raw = file.read(HEADER_SIZE)
+                    header = SegmentHeader.unpack(raw)
                     if header is not None:
                         break
+                    blank &= not any(raw)
                 else:
-                    self.warnings.append(f"{path.name} has no readable header; left out")
+                    if not (blank and is_live(self.folder)):  # then it is being made
+                        self.warnings.append(f"{path.name} has no readable header; left out")
                     return None
         except FileNotFoundError:  # a log in use: released since it was listed
             return None

@@ -123,6 +123,20 @@ def test_a_log_under_way_is_live(tmp_path):
         assert wal.place == wal.folder
 
 
+@pytest.mark.parametrize("raw", [b"", bytes(4096)], ids=["created", "reserved"])
+def test_a_segment_that_is_being_made_is_no_damage(tmp_path, raw):
+    with WriteAheadLog(wal_folder(tmp_path / "x.mcap")) as wal:
+        wal.define(CHANNEL)
+        made = wal.folder / "000009.seg"
+        made.write_bytes(raw)
+        assert read_wal(tmp_path / "x.mcap").warnings == ()
+        made.write_bytes(raw + b"x")
+        assert read_wal(tmp_path / "x.mcap").warnings == (
+            "000009.seg has no readable header; left out",
+        )
+        made.unlink()
+
+
 def test_messages_of_one_size_are_accepted_together_or_not_at_all(tmp_path):
     folder = tmp_path / "w"
     same = [(1, 10 * k, 20 * k, k, bytes([k]) * 100) for k in range(1, 11)]
