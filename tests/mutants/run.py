@@ -139,11 +139,11 @@ def tests_of(path):
 
 
 class Tree:
-    """A copy of the tree, in which one mutant at a time is planted."""
+    """A copy of the tree, in which one mutant at a time is planted; ``output`` is of its tests."""
 
     def __init__(self, folder):
         """Copy what git tracks."""
-        self.root = folder
+        self.root, self.output = folder, folder.with_suffix(".output")
         names = subprocess.run(
             ["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True
         ).stdout.split(b"\0")
@@ -182,9 +182,9 @@ class Tree:
         words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *words]
         env = os.environ | {"PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
         env |= {"UNDULOG_TEST_LIMIT_S": str(HANGS_S)}
-        with subprocess.Popen(
+        with self.output.open("w") as output, subprocess.Popen(
             list(map(str, words)), cwd=self.root, env=env, stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
         ) as process:  # fmt: skip
             try:
                 return process.wait(limit_s)
@@ -257,7 +257,7 @@ def main():
                 key = tuple(tests)
                 if key not in sound:
                     outcome, _ = tree.run(tests)
-                    assert outcome != "failed", f"without a fault these fail: {tests}"
+                    assert outcome != "failed", f"without a fault:\n{tree.output.read_text()}"
                     sound.add(key)
                 return mutant, *tree.tried(mutant, tests)
             finally:
