@@ -11,6 +11,7 @@ from support.plain_socketcand import SOCKETCAND, plain_server
 from support.processes import wait_for
 from support.simulated_clock import SimulatedClock
 from undulog.capture import load_robot
+from undulog.capture.common.errors import SourceError
 from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot, sent_text
@@ -60,6 +61,16 @@ def test_what_python_can_can_not_read_is_counted_and_nothing_is_printed(capfd):
     assert (taken, tally.counts.malformed) == ([0x201, 0x202, 0x203], 1)
     assert [event.text for event in tally.events.flush()] == ["malformed message"]
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_bus_that_can_not_be_opened_says_why(tmp_path):
+    on = f"can:slcan:{tmp_path}/none"
+    with pytest.raises(SourceError) as missing:
+        open_link(parse_address(on), Tally(lambda: 0))
+    assert str(missing.value).startswith(f"{on}: can't open it: ")
+    with pytest.raises(SourceError) as never:  # without its driver it never can
+        open_link(parse_address("can:nican:x"), Tally(lambda: 0))
+    assert "can't open it" not in str(never.value)
 
 
 def identifiers(arrays):
