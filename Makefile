@@ -49,12 +49,10 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 
 # Four processes at once: two of tests that compute, in the time that the others leave them, which
 # have the tests of processes, time and pictures, and wait more than they compute.
-ANALYSIS = tests/analysis
-COMPUTING = tests/docs tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py \
+ANALYSIS = tests/analysis tests/docs
+COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
   $(addprefix tests/capture/,bus following robot) \
-  $(addprefix tests/replay/,calibrate draw overlay sweep) \
-  $(addprefix tests/replay/test_,clip.py reproduce.py) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
 WAITING = tests/replay tests/sim
