@@ -140,18 +140,15 @@ class Recovery(Iterator[WalMessage]):
             check_regular(path)
             with path.open("rb") as file:
                 size = file.seek(0, os.SEEK_END)
-                blank = True
-                for at in (0, max(0, size - HEADER_SIZE)):
-                    file.seek(at)
-                    raw = file.read(HEADER_SIZE)
-                    header = SegmentHeader.unpack(raw)
-                    if header is not None:
-                        break
-                    blank &= not any(raw)
-                else:
-                    if not (blank and is_live(self.folder)):  # then it is being made
-                        self.warnings.append(f"{path.name} has no readable header; left out")
-                    return None
+                file.seek(0)
+                first = file.read(HEADER_SIZE)
+                file.seek(max(0, size - HEADER_SIZE))
+                last = file.read(HEADER_SIZE)
+            header = SegmentHeader.unpack(first) or SegmentHeader.unpack(last)
+            if header is None:
+                if any(first + last) or not is_live(self.folder):  # else it is being made
+                    self.warnings.append(f"{path.name} has no readable header; left out")
+                return None
         except FileNotFoundError:  # a log in use: released since it was listed
             return None
         except OSError as error:
