@@ -49,9 +49,9 @@ def with_ledger(rates, rows=None):
 
 def checked(booked, energies=JOINTS):
     """Compare with a ledger that books so much in the window [J]; returns closure and warnings."""
-    said = []
+    warnings = []
     rates = {name: whole_j / 4.0 for name, whole_j in booked.items()}
-    return energy.check_ledger(with_ledger(rates), energies, SPAN, said.append), said
+    return energy.check_ledger(with_ledger(rates), energies, SPAN, warnings.append), warnings
 
 
 def test_sums_are_over_joints_and_cycles():
@@ -67,8 +67,8 @@ def test_sums_are_over_joints_and_cycles():
 def test_each_term_is_compared_with_its_own(name):
     booked = {term: value for value, term in TERMS.values()}
     value, term = TERMS[name]
-    closure, said = checked(booked | {term: value - 0.02, "mechanical_residual": 0.07})
-    assert said == []
+    closure, warnings = checked(booked | {term: value - 0.02, "mechanical_residual": 0.07})
+    assert warnings == []
     whole = booked["mechanical_abs"] - 0.02 * (name == "abs")
     for other in TERMS:
         expected = 0.02 / whole if other == name else 0.0
@@ -86,14 +86,14 @@ def test_a_difference_of_more_than_a_twentieth_is_warned_of(name, most):
     booked = {term: value for value, term in TERMS.values()} | {"electrical_residual": 0.7}
     value, term = TERMS[name]
     for share, warned in ((0.99, False), (-0.99, False), (1.01, True), (-1.01, True)):
-        closure, said = checked(booked | {term: value + share * most})
+        closure, warnings = checked(booked | {term: value + share * most})
         kind = "mechanical" if name == "net" else "electrical"
         text = (
             f"{kind} energy is {value:.4g} J from the samples but {value + share * most:.4g} J in "
             "the twin's ledger (/energy_ledger): samples once a control cycle miss what happens "
             "within it"
         )
-        assert said == [text] * warned
+        assert warnings == [text] * warned
         assert getattr(closure, name) == pytest.approx(-share * most / 7.0)
         assert closure.electrical_balance == pytest.approx(0.1)
     for other in ("plus", "abs", "el_clipped"):  # they are not warned of
@@ -104,8 +104,8 @@ def test_what_is_booked_is_the_scale_where_it_is_more():
     booked = {term: value for value, term in TERMS.values()}
     few = [Energies(of([-0.95, 1.05], [0.0, 1.05]), None)]  # 0.1 J of 2 J
     booked["mechanical_net"] = -100.0
-    _, said = checked(booked, few)
-    assert len(said) == 1
+    _, warnings = checked(booked, few)
+    assert len(warnings) == 1
     mine = [Energies(of([100.0, 100.0], [100.0, 100.0]), None)]
     booked["mechanical_net"] = 210.4  # 10.4 J of 210.4 J
     assert checked(booked, mine)[1] == []
@@ -114,8 +114,8 @@ def test_what_is_booked_is_the_scale_where_it_is_more():
 
 
 def test_without_work_in_the_ledger_there_are_no_shares():
-    closure, said = checked({"mechanical_net": 3.0})
-    assert said == []
+    closure, warnings = checked({"mechanical_net": 3.0})
+    assert warnings == []
     assert (closure.net, closure.mechanical_balance) == (None, None)
     closure, _ = checked({"mechanical_net": 3.0, "mechanical_abs": 0.0})
     assert closure.net is None
@@ -139,9 +139,9 @@ def test_a_ledger_that_can_not_be_read_is_warned_of(error):
         del topic
         raise error
 
-    session, said = SimpleNamespace(channels={"/energy_ledger": None}, joints=fails), []
-    assert energy.check_ledger(session, JOINTS, SPAN, said.append) is None
-    assert said == [f"/energy_ledger can't be read: {error}"]
+    session, warnings = SimpleNamespace(channels={"/energy_ledger": None}, joints=fails), []
+    assert energy.check_ledger(session, JOINTS, SPAN, warnings.append) is None
+    assert warnings == [f"/energy_ledger can't be read: {error}"]
 
 
 def test_energies_of_all_joints_take_all_joints():

@@ -194,8 +194,9 @@ def reads_a_clock(node):
         if isinstance(one, ast.Attribute) and isinstance(one.value, ast.Name):
             if (one.value.id, one.attr) in CLOCKS:
                 return True
-        elif isinstance(one, ast.ImportFrom) and one.module == "time":
-            return True
+        elif isinstance(one, ast.ImportFrom) and one.module in {"time", "threading"}:
+            if one.module == "time" or "Timer" in {alias.name for alias in one.names}:
+                return True
         elif isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute):
             limits = [*one.args, *(word.value for word in one.keywords if word.arg == "timeout")]
             if one.func.attr in WAITS and any(is_short(limit) for limit in limits):
@@ -302,7 +303,11 @@ def test_of_a_helper():
 def test_of_a_timer():
     threading.Timer(gap, stop).start()
 
+def test_of_a_timer_by_its_name():
+    from threading import Timer
+
 def test_of_no_clock():
+    from threading import Thread
     simulated.sleep(1)
 
 @pytest.mark.clock(0.1, "why")
@@ -312,4 +317,7 @@ def test_marked():
 """
     (tmp_path / "test_one.py").write_text(code)
     marked, wrong = looked_at(tmp_path / "test_one.py")
-    assert (marked, wrong) == ({"test_marked"}, {"test_of_a_helper", "test_of_a_timer"})
+    assert (marked, wrong) == (
+        {"test_marked"},
+        {"test_of_a_helper", "test_of_a_timer", "test_of_a_timer_by_its_name"},
+    )

@@ -74,7 +74,7 @@ class Stage:
     """A recorder of some sources in simulated time, and the events of its session."""
 
     def __init__(self, path, time, sources, **options):
-        self.path, self.time, self.heard = path, time, []
+        self.path, self.time, self.reported = path, time, []
         options = {"robot": None, "decoded": None} | options
         self.clock = SessionClock(time.clock)
         self.writer = SessionWriter(path, session_id="s", epoch_ns=self.clock.epoch_ns)
@@ -85,7 +85,7 @@ class Stage:
             context=SourceContext(self.clock.now_ns, self.writer),
             **options,
         )
-        self.recorder.on_event(lambda *event: self.heard.append(event))
+        self.recorder.on_event(lambda *event: self.reported.append(event))
 
     def run(self, duration_s=1.0, stop=None):
         ending = self.recorder.run(stop or StopRequest(), duration_s)
@@ -97,7 +97,7 @@ class Stage:
         levels = {20: "info", 30: "warn", 40: "error"}
         with Session(self.path) as session:
             texts = [(levels[m.level], m.name, m.msg) for _, m in session.messages("/rosout")]
-        assert texts == [event[1:] for event in self.heard]
+        assert texts == [event[1:] for event in self.reported]
         return [event for event in texts if event[1] != "recorder"]
 
 
@@ -146,8 +146,8 @@ def test_sources_that_listen_are_started_last_and_all_are_stopped(stage_of, time
     assert [source.calls for source in sources] == [
         ["start", "end", "stop"], ["start", "stop"], ["start", "end", "stop"], ["start", "stop"],
     ]  # fmt: skip
-    assert stage.heard[0][1:] == ("info", "recorder", "recording a, b, c, d")
-    assert stage.heard[-1][1:] == ("info", "recorder", "ends: 1 s are over")
+    assert stage.reported[0][1:] == ("info", "recorder", "recording a, b, c, d")
+    assert stage.reported[-1][1:] == ("info", "recorder", "ends: 1 s are over")
     assert stage.events() == []
 
 
@@ -220,7 +220,7 @@ def test_when_all_sources_have_failed_the_recording_has(stage_of, time):
     stage = stage_of(Plain("a", time, {5: fail}), Plain("b", time, {3: fail}))
     ending = stage.run(None)
     assert (ending.reason, ending.failed) == ("all sources have ended", True)
-    assert stage.heard[-1][1:] == ("error", "recorder", "ends: all sources have ended")
+    assert stage.reported[-1][1:] == ("error", "recorder", "ends: all sources have ended")
 
 
 def test_failures_to_end_and_to_stop_are_reported(stage_of, time):
@@ -228,7 +228,7 @@ def test_failures_to_end_and_to_stop_are_reported(stage_of, time):
     source.end = source.stop = fail
     stage = stage_of(source, other)
     assert not stage.run().failed
-    texts = [text for *_, text in stage.heard if "can't be" in text]
+    texts = [text for *_, text in stage.reported if "can't be" in text]
     assert texts == [
         "this source can't be ended: ZeroDivisionError()",
         "this source can't be released: ZeroDivisionError()",
@@ -257,8 +257,8 @@ def test_events_of_sources_have_their_times(stage_of, time):
     stage.recorder.log_event("info", "x", "now")
     stage.run()
     assert stage.events() == [("info", "x", "now"), ("warn", "a", "lost the line")]
-    assert (t_ns, "warn", "a", "lost the line") in stage.heard
-    assert stage.heard[0][0] == stage.clock.epoch_ns
+    assert (t_ns, "warn", "a", "lost the line") in stage.reported
+    assert stage.reported[0][0] == stage.clock.epoch_ns
 
 
 def test_the_clock_of_a_source_is_written_each_second(stage_of, time):

@@ -32,8 +32,8 @@ def frames(*rows, way=DIR_RX):
 
 def tick(number, phase=Phase.RUN, command=None, gait=None, *, received=(), sent=None, remarks=()):
     angles = None if command is None else np.full(25, command)
-    wanted = None if command is None else angles + 0.5
-    step = GateStep(phase, angles, wanted, gait, tuple(remarks))
+    demand = None if command is None else angles + 0.5
+    step = GateStep(phase, angles, demand, gait, tuple(remarks))
     return BusTick(number, step, received, frames() if sent is None else sent)
 
 
@@ -67,7 +67,7 @@ def written(tmp_path):
         one.close()
 
 
-def said(session):
+def remarks_of(session):
     return [message.msg for _, message in session.messages("/rosout")]
 
 
@@ -83,8 +83,8 @@ def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
     commands = session.joints("/joint_commands").signal("joint07")
     np.testing.assert_allclose(commands.values, [0.1, 0.2, 0.3, 0.4])
     np.testing.assert_array_equal((commands.t_ns - EPOCH_NS) / MS, [10, 20, 30, 50])
-    wanted = session.joints("/gate/wanted").signal("joint07")
-    np.testing.assert_allclose(wanted.values, [0.6, 0.7, 0.8, 0.9])
+    demand = session.joints("/gate/wanted").signal("joint07")
+    np.testing.assert_allclose(demand.values, [0.6, 0.7, 0.8, 0.9])
     meant = session.joints("/gait").signal("b")
     np.testing.assert_array_equal(meant.values, [2.0, 4.0, 6.0])
 
@@ -95,7 +95,7 @@ def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
     assert changes("/gate/phase") == [
         (0, "reading the pose"), (10, "approach"), (20, "run"), (60, "done"),
     ]  # fmt: skip
-    assert said(session) == [
+    assert remarks_of(session) == [
         "joint02 clamped to the joint limits",
         "joint03 clamped to the joint limits",
         "stopped: asked; the joints were held",
@@ -153,7 +153,7 @@ def test_an_event_is_written_once(written):
 
     events = [GateEvent("warn", "gate: so"), GateEvent("info", "gate: run")]
     session = written(tick(0, remarks=events), tick(1, remarks=events[:1]), more=log)
-    texts = said(session)
+    texts = remarks_of(session)
     assert texts[-3:] == ["one", "two", "stopped: asked; the joints were held"]
     assert texts[:3] == ["gate: so", "gate: run", "gate: so"]  # the gate tells it once itself
 
@@ -197,7 +197,7 @@ def test_the_verdict_follows_the_outcome_and_the_warnings(
 
 def test_a_failure_is_the_verdict(written):
     session = written(tick(0), end=None, more=lambda one: one.fail("no gait"))
-    assert (session.verdict, said(session)) == ("bad", ["no gait"])
+    assert (session.verdict, remarks_of(session)) == ("bad", ["no gait"])
 
 
 def test_in_lockstep_frames_have_the_time_of_their_tick():
