@@ -1,6 +1,8 @@
 """Sessions of known truth, written with a foreign writer (mcap-ros2-support), not with ours;
 results built by hand; experiments with a linear chain."""
 
+import zlib
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,14 @@ from support.joint_runs import write_joints
 from support.written_sessions import joint_state, write_foreign
 
 EPOCH_NS = 1_735_689_600_123_456_789
+
+
+@pytest.fixture(autouse=True)
+def _own_draws(request):
+    """Begin a module's ``RNG`` anew for each test, by its name: it draws the same if run alone."""
+    if (rng := getattr(request.module, "RNG", None)) is not None:
+        seed = zlib.crc32(request.node.name.encode())
+        rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
 
 
 class Bag:
