@@ -121,7 +121,7 @@ def power_limit(power_w: FloatArray) -> float:
         power is known or all of it is zero.
     """
     known = np.abs(power_w[np.isfinite(power_w)])
-    limit = known.size and float(np.percentile(known, 99.0))
+    limit = float(np.percentile(known, 99.0)) if known.size else 0.0
     if not limit:
         return 1.0
     unit = 10.0 ** (np.floor(np.log10(limit)) - 1.0)

@@ -88,7 +88,7 @@ class Gate:
         self.silence = Silence()
         self.held_ticks = 0
         self._silent_ticks = 0  # those of the silence that were counted by then
-        self._was_received: bool  # in the tick before this one; while holding
+        self._was_received = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place
         self._listen_s = listen_s
         self._last = round(duration_s * CONTROL_RATE_HZ)
