@@ -207,7 +207,7 @@ def test_ctrl_c_leaves_nothing_behind(session_file, vulkan, tmp_path):
     with process(*UNDULOG, "view", session_file, *words, **options) as running:
         wait_for((tmp_path / "a.mp4.part").exists, "the clip", alive=[running])
         os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all in front
-        _, err = running.communicate(timeout=60)
+        _, err = running.communicate()
     assert running.returncode == 1
     assert "stopped on request" in err
     assert (list(scratch.iterdir()), list(tmp_path.iterdir())) == ([], [scratch])

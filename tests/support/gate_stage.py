@@ -165,7 +165,7 @@ class Stage:
                 bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
                 wait_for(lambda: self._heard_of(f'"id": {MARK},'), "the mark")
         self._listener.send_signal(signal.SIGTERM)
-        _, complained = self._listener.communicate(timeout=20)
+        _, complained = self._listener.communicate()
         assert self._listener.returncode == 0, complained
 
 
@@ -213,7 +213,7 @@ class Driving:
         pause(pause_s)
 
     def communicate(self):
-        out, err = self.controller.communicate(timeout=120)
+        out, err = self.controller.communicate()
         self.stage.settle()
         self._check_silence(err or "")
         return out, err

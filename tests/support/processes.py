@@ -80,7 +80,7 @@ def serving(scenario, *words, place="0", **options):
         yield robot, json.loads(line)
 
 
-def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=(), pause_s=0.005):
+def wait_for(condition, what="", seconds=600.0, *, each=lambda: None, alive=(), pause_s=0.005):
     """Return the value of a condition as soon as it holds; the processes ``alive`` must run."""
     deadline = time.monotonic() + seconds
     while not (found := condition()):

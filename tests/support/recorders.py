@@ -36,7 +36,7 @@ def ended(running, number=None):
     """The report of a recorder that ends, after a signal if one is given, and its errors."""
     if number is not None:
         running.send_signal(number)
-    out, err = running.communicate(timeout=60)
+    out, err = running.communicate()
     assert "Traceback" not in err, err
     return json.loads(out) if out else None, err
 

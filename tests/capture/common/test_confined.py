@@ -275,7 +275,7 @@ def test_the_end_of_the_parent_ends_the_process(path, number):
     with parent:
         pid = int(parent.stdout.readline())
         parent.send_signal(number)
-        parent.communicate(timeout=60)
+        parent.communicate()
     assert parent.returncode != 0
     wait_for(lambda: not is_alive(pid), "the child ends with its parent")
 

@@ -68,7 +68,7 @@ def record_and_kill(cycle, folder, seed, *options):
         )
         killed_ns = time.monotonic_ns()
         recorder.kill()
-        recorder.wait(timeout=30)
+        recorder.wait()
     return session, [accepted_before(log, killed_ns - SAFE_NS) for log in logs]
 
 

@@ -92,7 +92,7 @@ def test_twenty_thousand_frames_of_a_foreign_process(path, reader, per_packet, h
     truth = foreign_truth(0, 20_000)
     with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
         found = reader.until_frames(20_000)
-        assert process.wait(60) == 0
+        assert process.wait() == 0
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
     assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
@@ -108,7 +108,7 @@ def test_what_our_sender_offers_arrives(tmp_path, path, reader):
     np.save(tmp_path / "frames.npy", truth)
     with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
         found = reader.until_frames(20_000)
-        accepted, refused = json.loads(process.communicate(timeout=60)[0])
+        accepted, refused = json.loads(process.communicate()[0])
     reader.until_event("disconnected")
     assert accepted == 20_000
     assert same(found, truth)
@@ -198,7 +198,7 @@ def test_a_sender_may_leave_and_come_back(path, reader):
         with start(sys.executable, "-c", FOREIGN, path, first, 100, 10, 1) as process:
             reader.until_frames(first + 100)
             reader.until(lambda: not reader.source.connected)
-            assert process.wait(60) == 0
+            assert process.wait() == 0
     assert same(reader.frames, foreign_truth(0, 200))
     assert reader.counts.reconnects == 1
     reader.until_event("is back")

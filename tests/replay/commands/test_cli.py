@@ -76,6 +76,6 @@ def test_web_serves_this_machine_only_until_it_is_ended(session_file, tmp_path):
         wait_for(lambda: listening(data), alive=(process,))  # the page may answer before it does
         assert listening(page, data) == {("0100007F", port) for port in (page, data)}
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=20) == 0
+        assert process.wait() == 0
         assert not listening(page)
         assert list(tmp_path.iterdir()) == []

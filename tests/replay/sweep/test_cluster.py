@@ -60,7 +60,7 @@ def test_rows_are_the_same_though_run_worker_and_scheduler_are_killed(local, tmp
         first.wait()
         stack.enter_context(scheduler(port))
         stack.enter_context(workers(port, tmp_path / "dask2"))
-        out, err = sweep.communicate(timeout=300)
+        out, err = sweep.communicate()
     assert sweep.returncode == 0, err
     report = json.loads(out)
     assert (report["run"], report["failed"], report["complete"]) == (20, 0, True)
@@ -79,7 +79,7 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
     with scheduler(port), workers(port, tmp_path / "dask"), process(*words, *cluster) as sweep:
         wait_for_rows(output, 3)
         sweep.send_signal(signal.SIGINT)
-        out, _ = sweep.communicate(timeout=60)
+        out, _ = sweep.communicate()
     assert json.loads(out)["complete"] is False
     there = len(rows_of(output))
     rest = json.loads(undulog(*words[3:]).stdout)

@@ -60,7 +60,7 @@ def test_a_process_that_stands_still_during_a_run_is_ended(sweep, monkeypatch):
 def test_a_cluster_without_workers_is_given_up(tmp_path):
     port = free_port()
     with scheduler(port), swept(tmp_path, port, 8.0) as sweep:
-        out, _ = sweep.communicate(timeout=300)
+        out, _ = sweep.communicate()
     assert out.startswith(f"tcp://127.0.0.1:{port}: a worker of the cluster did not answer within")
 
 
@@ -74,7 +74,7 @@ def test_a_scheduler_that_stands_still_is_given_up(tmp_path):
     ):
         assert sweep.stdout.readline() == "a row\n", others.poll()
         freeze(running.pid)
-        out, err = sweep.communicate(timeout=300)
+        out, err = sweep.communicate()
     assert out.startswith(f"tcp://127.0.0.1:{port}: the Dask scheduler did not answer within 8 s; ")
     assert (err, sweep.returncode) == ("", 0)
 

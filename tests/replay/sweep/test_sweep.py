@@ -174,7 +174,7 @@ def test_a_sweep_that_was_interrupted_twice_goes_on_where_it_stopped(signals, re
             workers = _workers(sweep.pid)
             assert len(workers) == 2
             sweep.send_signal(signal.Signals[name])
-            out, errors = sweep.communicate(timeout=60)
+            out, errors = sweep.communicate()
         there = len(rows_of(tmp_path / "rows"))
         assert before < there < 10
         if name != "SIGKILL":
@@ -196,7 +196,7 @@ def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     with process(*words) as sweep:
         _begun(tmp_path / "rows")
         os.kill(_workers(sweep.pid)[0], signal.SIGKILL)
-        out, err = sweep.communicate(timeout=120)
+        out, err = sweep.communicate()
     report = json.loads(out)
     assert (report["run"], report["failed"], err) == (10, 0, "")
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")

@@ -119,7 +119,7 @@ def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of)
         words = (*UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={ready['port']}")
         words += ("--arm", "-o", path, "--duration", "600")
         with process(*words) as controller:
-            _, err = controller.communicate(timeout=120)
+            _, err = controller.communicate()
             assert controller.returncode == 1, err
     written = check_told(err, path, disk, ramp_rate=0.5)
     assert len(written.commands) > 1000
@@ -130,7 +130,7 @@ def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk_o
     disk = disk_of("44m")
     path = disk / "a.mcap"
     with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        _, err = controller.communicate(timeout=60)
+        _, err = controller.communicate()
         on_stage.settle()
         assert on_stage.lines
         assert not on_stage.command_lines

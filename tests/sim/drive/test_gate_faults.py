@@ -148,7 +148,7 @@ def refused(folder, scenario, sessions):
             for name, chosen in sessions.items()
         }
         for name, controller in started.items():
-            _, noted[name] = controller.communicate(timeout=60)
+            _, noted[name] = controller.communicate()
             assert controller.returncode == 2, (name, noted)
             assert not (folder / f"{name}-out.mcap").exists(), name
         on_stage.settle()
@@ -302,7 +302,7 @@ def test_a_robot_that_comes_late_is_not_the_controllers_fault(driving):
         drive.stage.robot.send_signal(signal.SIGSTOP)
         drive.signal(signal.SIGINT, 0.5)
         drive.signal(signal.SIGINT)
-        drive.controller.wait(timeout=60)
+        drive.controller.wait()
         drive.stage.robot.send_signal(signal.SIGCONT)
         with pytest.raises(LateComputerError):
             drive.ended()
@@ -324,7 +324,7 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
         staged(tmp_path, "flat", pace="--lockstep") as on_stage,
         on_stage.replay(steps, path) as controller,
     ):
-        out, err = controller.communicate(timeout=120)
+        out, err = controller.communicate()
         on_stage.settle()
         lines = on_stage.lines
     assert controller.returncode in {0, 1}, (out, err)  # such steps can be too much for the servos

@@ -87,7 +87,7 @@ class Drive:
 
     def end(self):
         """Wait for it: the exit code, the report, the session, and what arrived."""
-        out, self.errors = self.running.communicate(timeout=60)
+        out, self.errors = self.running.communicate()
         self.code, self.report = self.running.returncode, json.loads(out)
         self.route("hold none")
         time.sleep(0.3)
@@ -137,7 +137,7 @@ def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=
         words += ["-o", str(path), "--duration", str(duration_s)]
         env = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
         with process(sys.executable, "-c", DRIVE, *words, env=env) as drive.running:
-            assert robot.stdout.readline() == "first\n", drive.running.communicate(timeout=60)
+            assert robot.stdout.readline() == "first\n", drive.running.communicate()
             time.sleep(1.2)
             yield drive
 

@@ -153,7 +153,7 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
         with process(*UNDULOG, *words, env=alone) as driving:
             wait_for(lambda: part.exists() and part.stat().st_size > 200_000, alive=[driving])
             driving.send_signal(number)
-            shown, complained = driving.communicate(timeout=60)
+            shown, complained = driving.communicate()
     assert driving.returncode == 1
     why = {
         signal.SIGTERM: "stop requested (SIGTERM)",
