@@ -32,6 +32,11 @@ NYQUIST_SHARE = 0.45
 DRIVEN_SHARE = 0.01
 """A joint whose command moves less than this share of the liveliest is held still."""
 
+STILL = 1e-9
+"""Range up to which a channel stands still, in rad or in its largest magnitude: hundreds of
+times the rounding of a sine in an hour of a fast gait (2e-16 of a phase of 1e4 rad), hundreds of
+times less than the step of a fine encoder (24 bit: 4e-7 rad)."""
+
 _SCOUTS = 4
 """Channels that the first search looks at: the livelier ones."""
 
@@ -75,10 +80,10 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [one for one in series if one.count > MIN_SAMPLES and np.ptp(one.values) > 0]
+    moving = [one for one in series if one.count > MIN_SAMPLES and moves(one)]
     if not moving or duration_s <= 0:
         return None
-    scouts = _liveliest(moving)
+    scouts = liveliest(moving)
     peak = _periodogram_peak(scouts, duration_s)
     best: Rhythm | None = None
     # A second harmonic that is stronger than the fundamental makes the peak an octave too high.
@@ -91,6 +96,13 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         if best.explained >= MIN_EXPLAINED:
             break
     return best
+
+
+def moves(series: Series) -> bool:
+    """Whether a channel moves by more than the rounding of its values."""
+    if not series.count:
+        return False
+    return float(np.ptp(series.values)) > STILL * max(1.0, float(np.max(np.abs(series.values))))
 
 
 def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> HarmonicModel:
@@ -159,10 +171,11 @@ def refine(series: Sequence[Series], omega: float) -> Rhythm | None:
     Returns:
         The rhythm; None where the samples are too few or no frequency fits.
     """
-    return _refined(_liveliest(series), series, omega)
+    return _refined(liveliest(series), series, omega)
 
 
-def _liveliest(series: Sequence[Series]) -> list[Series]:
+def liveliest(series: Sequence[Series]) -> list[Series]:
+    """Return the few channels that move most, from which a frequency is found."""
     return sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
 
 
