@@ -14,6 +14,7 @@ from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
 from ..estimators.trends import Trend
+from ..estimators.turning import turning_beside_others
 from ..results.answer import Lacking, Note, Refusal, distinct, percent
 from ..results.estimate import Estimate
 from .changes import (
@@ -135,6 +136,7 @@ def fit_gait(
     Returns:
         The fit, or None, with a warning that says why, where there is no gait.
     """
+    commands = _swinging(commands, warn)
     known = list((commands or responses).values())
     kind = "commands" if commands else "responses"
     if commands:
@@ -159,6 +161,15 @@ def fit_gait(
         _group_fit(group, fit, amplitudes, warn) for group, fit in zip(channels, fits, strict=True)
     ]
     return replace(groups[0], others=tuple(groups[1:]))
+
+
+def _swinging(commands: Mapping[str, Series], warn: Warn) -> Mapping[str, Series]:
+    """Return the commands without those that turn without end beside others."""
+    turning = turning_beside_others({name: one.values for name, one in commands.items()})
+    if turning:
+        turn = "turns" if len(turning) == 1 else "turn"
+        warn(Note(f"{', '.join(turning)} {turn} without end: gain and lag are null"))
+    return {name: one for name, one in commands.items() if name not in turning}
 
 
 def _warn_no_gait(

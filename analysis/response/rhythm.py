@@ -18,7 +18,7 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at, fit_shared
-from ..estimators.series import Series
+from ..estimators.series import Series, moves
 
 MIN_CYCLES = 3.0
 MIN_EXPLAINED = 0.8
@@ -31,11 +31,6 @@ NYQUIST_SHARE = 0.45
 
 DRIVEN_SHARE = 0.01
 """A joint whose command moves less than this share of the liveliest is held still."""
-
-STILL = 1e-9
-"""Range up to which a channel stands still, in rad or in its largest magnitude: hundreds of
-times the rounding of a sine in an hour of a fast gait (2e-16 of a phase of 1e4 rad), hundreds of
-times less than the step of a fine encoder (24 bit: 4e-7 rad)."""
 
 _SCOUTS = 4
 """Channels that the first search looks at: the livelier ones."""
@@ -80,7 +75,7 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [one for one in series if one.count > MIN_SAMPLES and moves(one)]
+    moving = [one for one in series if one.count > MIN_SAMPLES and moves(one.values)]
     if not moving or duration_s <= 0:
         return None
     scouts = liveliest(moving)
@@ -96,13 +91,6 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         if best.explained >= MIN_EXPLAINED:
             break
     return best
-
-
-def moves(series: Series) -> bool:
-    """Whether a channel moves by more than the rounding of its values."""
-    if not series.count:
-        return False
-    return float(np.ptp(series.values)) > STILL * max(1.0, float(np.max(np.abs(series.values))))
 
 
 def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> HarmonicModel:

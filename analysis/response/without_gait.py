@@ -17,10 +17,10 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.harmonic import HarmonicModel, fit_at, fit_shared
-from ..estimators.series import Series
+from ..estimators.series import Series, moves
 from ..results.answer import percent
 from .groups import Groups
-from .rhythm import MIN_CYCLES, MIN_EXPLAINED, MIN_SAMPLES, NYQUIST_SHARE, liveliest, moves
+from .rhythm import MIN_CYCLES, MIN_EXPLAINED, MIN_SAMPLES, NYQUIST_SHARE, liveliest
 
 SINE_EXPLAINED = 0.98
 """Share of the variance above which one sine is all that is commanded: the square of the
@@ -159,7 +159,7 @@ def why_no_gait(
     Returns:
         A sentence without its full stop.
     """
-    if not any(moves(one) for one in known):
+    if not any(moves(one.values) for one in known):
         return f"no gait: the {kind} never move; {_NULLS}"
     if isinstance(unusable, TooSeldom):
         return f"no gait: {too_seldom_in_words(unusable, kind)}; {_NULLS}"
@@ -182,4 +182,4 @@ def why_no_gait(
 
 
 def _moving(series: Sequence[Series]) -> list[Series]:
-    return [one for one in series if one.count > MIN_SAMPLES and moves(one)]
+    return [one for one in series if one.count > MIN_SAMPLES and moves(one.values)]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.find import MOST_JOINTS
@@ -16,6 +18,7 @@ from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
+from ..estimators.turning import turning_beside_others
 from ..response.rhythm import DRIVEN_SHARE
 from ..results.answer import Lacking, Note
 
@@ -66,14 +69,24 @@ class Columns:
         signals: Mapping[str, Signal] = getattr(self, quantity)
         return signals
 
+    @cached_property
+    def turning(self) -> frozenset[str]:
+        """Joints whose command turns without end, beside others that swing."""
+        return frozenset(turning_beside_others(self._usable_commands))
+
+    @cached_property
+    def _usable_commands(self) -> dict[str, FloatArray]:
+        usable = {n: s.values[np.abs(s.values) <= LARGEST] for n, s in self.command.items()}
+        return {name: values for name, values in usable.items() if values.size}
+
     def commanded(self) -> tuple[str, ...]:
-        """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest."""
-        swing: dict[str, float] = {}
-        for name, signal in self.command.items():
-            usable = signal.values[np.abs(signal.values) <= LARGEST]
-            if usable.size:
-                swing[name] = float(np.ptp(usable))
-        least = DRIVEN_SHARE * max(swing.values(), default=0.0)
+        """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest.
+
+        Joints that turn without end are among them, and no measure for the others.
+        """
+        swing = {name: float(np.ptp(values)) for name, values in self._usable_commands.items()}
+        swings = (size for name, size in swing.items() if name not in self.turning)
+        least = DRIVEN_SHARE * max(swings, default=0.0)
         return tuple(name for name in self.names if swing.get(name, 0.0) > least)
 
 

@@ -174,6 +174,7 @@ def _has_gait(columns: Columns, stretch: Stretch) -> bool:
     series = [
         clean(name, signal.t_ns, signal.values, stretch.start_ns).between(0.0, stretch.duration_s)
         for name, signal in columns.command.items()
+        if name not in columns.turning
     ]
     found = find_groups(series, stretch.duration_s)
     return found is not None and found.explained >= MIN_EXPLAINED
@@ -266,6 +267,7 @@ def _in_motion(
     series = [
         clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
         for name, signal in columns.command.items()
+        if name not in columns.turning
     ]
     span = moving(series)
     if span is None:

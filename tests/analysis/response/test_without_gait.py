@@ -6,11 +6,11 @@ import pytest
 from support.analysed import analysed
 from support.joint_runs import write_joints
 from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.series import Series, moves
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.response.frequency_response import find_excitation
 from undulog.analysis.response.groups import Groups
-from undulog.analysis.response.rhythm import Rhythm, moves
+from undulog.analysis.response.rhythm import Rhythm
 from undulog.analysis.response.without_gait import few_cycles, too_seldom, why_no_gait
 from undulog.analysis.results.answer import Answer, Leading, Refusal, Remarks, Verdict, led
 
@@ -95,9 +95,9 @@ def test_what_lies_within_the_band_is_sampled_often_enough():
 
 def test_rounding_is_no_motion():
     turns = 2 * np.pi * np.arange(72_000.0)  # an hour, one sample a cycle
-    assert not moves(Series("a", turns, 0.4 * np.sin(turns - 0.6)))
-    assert not moves(Series("a", turns[:0], turns[:0]))
-    assert moves(Series("a", T, 1e-6 * np.sin(T)))
+    assert not moves(0.4 * np.sin(turns - 0.6))
+    assert not moves(turns[:0])
+    assert moves(1e-6 * np.sin(T))
     assert find_excitation(Series("a", T, 0.4 + 1e-13 * np.sin(99.0 * T))) is None
 
 
