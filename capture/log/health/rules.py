@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
+from ..columns.names import one_name_sentences
 from ..messages import COMMAND_TOPIC
 from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
@@ -233,7 +234,7 @@ def has_rhythm(topic: str) -> bool:
 def judge_series(
     health: SeriesHealth, start_ns: int, end_ns: int, commands_ns: int | None = None
 ) -> Iterator[Fault]:
-    """Yield what is wrong with the rhythm of one series.
+    """Yield what is wrong with the names and the rhythm of one series.
 
     Args:
         start_ns: Log time of the session's first message [Unix ns].
@@ -243,6 +244,8 @@ def judge_series(
     Yields:
         The faults; none for view aids and for the recorder's own topics.
     """
+    for sentence in one_name_sentences([health.names]):
+        yield Fault(1, health.topic, "", f"{sentence}; give each its name")
     timing, label = health.timing, health.label
     if timing.median_s is None or not has_rhythm(health.topic):
         return

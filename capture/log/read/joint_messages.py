@@ -20,6 +20,7 @@ import numpy as np
 from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
 from ..columns.layouts import Group, names_of
+from ..columns.names import distinct_names, one_name_sentences
 from ..messages.cdr import LITTLE_ENDIAN_HEADER, Layout
 from ..messages.definitions import (
     CONTROLLER_STATE,
@@ -300,7 +301,7 @@ def read_trajectory(log_ns: int, message: bytes) -> Trajectory:
         raise DataError(f"encapsulation {message[:2].hex()} is not little-endian CDR")
     cursor = _Cursor(message)
     stamp_ns, _ = cursor.time_ns(), cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
+    names = distinct_names([cursor.text() for _ in range(cursor.count())])
     count = cursor.count()
     if count > _MOST_POINTS:
         raise DataError(f"a trajectory of {count} points can't be right")
@@ -428,6 +429,8 @@ def merge_rows(
                 f"{topic}: {len(row.stamp_ns)} messages have {len(row.names)} names but "
                 f"{row.values.shape[1]} values of {field}; they are left out"
             )
+    for sentence in one_name_sentences(row.names for row in filled):
+        warn(f"{topic}: {sentence}")
     if len(filled) == 1:
         row = filled[0]
         t_ns, order = _in_time(row.stamp_ns, f"{topic}", warn)

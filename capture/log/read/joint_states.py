@@ -16,6 +16,7 @@ from ...common.arrays import NS, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
+from ..columns.names import distinct_names
 from ..columns.topics import Channel, Topics
 from ..messages.definitions import FLOAT_ARRAY, JOINT_STATE, TRAJECTORY
 from .joint_messages import (
@@ -406,7 +407,7 @@ class JointReader:
             stamp_ns = int(stamp.sec) * NS + int(stamp.nanosec)
             values = np.array([getattr(message, field)], dtype=np.float64)
             times = np.array([stamp_ns]), np.array([item.log_ns])
-            rows.append(JointRows(tuple(message.name), *times, values))
+            rows.append(JointRows(distinct_names(message.name), *times, values))
         if lost:
             self._warn(f"{source.topic}: {lost} messages can't be read: {found.unread[0].why}")
         return rows

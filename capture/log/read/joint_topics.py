@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from ...common.errors import DataError, JointSetError, MissingChannelError, some_names
+from ..columns.names import distinct_names
 from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import (
@@ -96,9 +97,12 @@ def _of_joints(topics: Topics) -> list[str]:
 def _joints(message: Any) -> list[str]:
     """Return the joints of a message; of a DynamicJointState those with a position."""
     if hasattr(message, "interface_values"):
-        pairs = zip(message.joint_names, message.interface_values, strict=False)
+        names = distinct_names(message.joint_names)
+        pairs = zip(names, message.interface_values, strict=False)
         return [name for name, one in pairs if "position" in one.interface_names]
-    return list(getattr(message, "joint_names", None) or getattr(message, "name", ()))
+    return list(
+        distinct_names(getattr(message, "joint_names", None) or getattr(message, "name", ()))
+    )
 
 
 def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) -> None:
