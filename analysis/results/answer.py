@@ -264,7 +264,7 @@ def led(answer: Answer, leading: Sequence[str]) -> Answer:
 
 def _first_clause(text: str) -> str:
     clause = re.split(r"; | \(", text.removeprefix("no gait: "))[0]
-    return f"{clause[:1].upper()}{clause[1:]}."
+    return f"{clause[:1].upper()}{clause[1:]}{'' if clause.endswith('...') else '.'}"
 
 
 EITHER = "stick or play, not separable"

@@ -20,7 +20,7 @@ from undulog.capture.robot.model import Robot
 
 from ..estimators.turning import turning_beside_others
 from ..response.rhythm import DRIVEN_SHARE
-from ..results.answer import Lacking, Note
+from ..results.answer import Lacking, Leading, Note
 
 DRAG_RATIO = 10.0
 """K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""
@@ -154,6 +154,10 @@ def read_columns(
             named = f" (other joints: {', '.join(topics.others)}; choose with {option})"
             logged = "no command logged: " if key == "command" else ""
             nulls = f"gain and lag are null{named if topics.others else ''}"
+            if key == "command" and topics.unnamed:
+                why = " and ".join(topics.unnamed)
+                warn(Leading(f"no commands of named joints: {why}; gain and lag are null"))
+                continue
             warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):

@@ -18,7 +18,7 @@ from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.names import distinct_names
 from ..columns.topics import Channel, Topics
-from ..messages.definitions import FLOAT_ARRAY, JOINT_STATE, TRAJECTORY
+from ..messages.definitions import FLOAT_ARRAYS, JOINT_STATE, TRAJECTORY
 from .joint_messages import (
     INTERFACE_UNITS,
     UNITS,
@@ -331,7 +331,7 @@ class JointReader:
         except DataError as error:
             raise DataError(f"{self._path}: {error}") from None
         rows.extend(self._general_rows(source, kind, field, messages))
-        if kind == FLOAT_ARRAY:  # whose times are the log's already
+        if kind in FLOAT_ARRAYS:  # whose times are the log's already
             return rows
         return [self._on_log_clock(row, source.topic) for row in rows]
 
