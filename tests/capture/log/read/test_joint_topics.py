@@ -74,8 +74,8 @@ def test_states_that_could_be_either_are_not_taken(tmp_path):
 
 
 LACKING = (
-    "/forward/commands, std_msgs/msg/Float64MultiArray, has 4 values without names: name its joints "
-    "in their order, --command-topic /forward/commands:JOINT,JOINT,..."
+    "/forward/commands, std_msgs/msg/Float64MultiArray, has 4 values without names: name its "
+    "joints in their order, --command-topic /forward/commands:JOINT,JOINT,..."
 )
 
 
