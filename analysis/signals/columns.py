@@ -9,12 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.find import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
+from undulog.capture.log.read.pauses import without_pauses
 from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
@@ -177,6 +178,7 @@ def read_columns(
         key: {name: signals.signal(name) for name in signals.names}
         for key, signals in found.items()
     }
+    _leave_out_pauses(by_name, response_topic, session.start_ns, warn)
     absent: dict[str, Signal] = {}
     return Columns(
         names=tuple(seen),
@@ -184,6 +186,28 @@ def read_columns(
         powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
         topics={key: wanted[key][0] for key in found},
         excitation=by_name.get("excitation", absent),
+    )
+
+
+def _leave_out_pauses(
+    by_name: dict[str, dict[str, Signal]], topic: str, start_ns: int, warn: Warn
+) -> None:
+    """Leave out of the measured quantities what a driver repeats while its bus is silent."""
+    measured = [key for key in ("position", "velocity", "effort") if key in by_name]
+    if "position" not in measured:
+        return
+    commands = by_name.get("command", {})
+    pauses_ns, thinned = without_pauses(commands, *(by_name[key] for key in measured))
+    if not len(pauses_ns):
+        return
+    by_name.update(zip(measured, thinned, strict=True))
+    lasted_s = (pauses_ns[:, 1] - pauses_ns[:, 0]) / NS
+    longest = int(lasted_s.argmax())
+    since_s = (int(pauses_ns[longest, 0]) - start_ns) / NS
+    pauses = "1 pause" if len(pauses_ns) == 1 else f"{len(pauses_ns)} pauses"
+    warn(
+        f"{topic}: all joints repeat their values together for {lasted_s.sum():.3g} s, in {pauses} "
+        f"(the longest from {since_s:.3g} s on): the bus or its driver paused; left out"
     )
 
 
