@@ -16,7 +16,7 @@ from ...common.arrays import NS, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
-from ..columns.names import distinct_names
+from ..columns.names import distinct_names, one_name_sentences
 from ..columns.topics import Channel, Topics
 from ..messages.definitions import FLOAT_ARRAYS, JOINT_STATE, TRAJECTORY
 from .joint_messages import (
@@ -203,7 +203,11 @@ class JointReader:
         """
         found = self._topics.read(self.requests(wanted), window_ns)
         keys = [(name, field) for name, fields in wanted.items() for field in fields]
-        return {key: self._rows(*key, found) for key in keys}
+        rows = {key: self._rows(*key, found) for key in keys}
+        for (name, _), several in rows.items():
+            for sentence in one_name_sentences(row.names for row in several):
+                self._warn(f"{name}: {sentence}")
+        return rows
 
     def signals(
         self,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from support.analysed import analysed
-from support.ros_bags import TRAJECTORY, header, message, point, write_bag
+from support.ros_bags import TRAJECTORY, filling, header, message, point, write_bag
 from support.written_sessions import EPOCH_NS, joint_state, write_foreign
 from undulog.capture import Session
+from undulog.capture.exchange.bag_import import import_bag
 from undulog.capture.log.columns.names import (
     distinct_names,
     one_name_sentences,
@@ -128,3 +129,18 @@ def test_the_points_of_a_trajectory_keep_both_joints(tmp_path):
         signals = session.joints("/goal")
         assert signals.names == ("a", "a (2)")
         assert [values.tolist() for values in signals.values] == [[0.1], [0.2]]
+
+
+def test_an_import_keeps_both_joints_and_reports_them(tmp_path):
+    def fill(own, t_ns, t_s):
+        for topic in ("/joint_states", "/joint_commands"):
+            own.state(t_ns, t_s, topic, [0.1, 0.2, 0.3], ("a", "b", "b"))
+
+    bag = write_bag(tmp_path / "bag", filling(fill, 0.2))
+    report = import_bag(bag, tmp_path / "run.mcap")
+    sentence = "2 joints are named b: the second is read as b (2)"
+    assert f"/joint_states: {sentence}" in report.problems
+    with Session.open(tmp_path / "run.mcap") as session:
+        signals = session.joints("/joint_states")
+        assert signals.names == ("a", "b", "b (2)")
+        assert [values[0] for values in signals.values] == [0.1, 0.2, 0.3]
