@@ -14,6 +14,11 @@ from undulog.capture.log.read.sample_times import LARGEST, Signal
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""
 
+STILL = 1e-9
+"""Range up to which a channel stands still, in rad or in its largest magnitude: hundreds of
+times the rounding of a sine in an hour of a fast gait (2e-16 of a phase of 1e4 rad), hundreds of
+times less than the step of a fine encoder (24 bit: 4e-7 rad)."""
+
 _HALF_NS = 0.5e-9
 
 
@@ -90,6 +95,17 @@ class Series:
         """
         # Times are whole ns but for rounding.
         return np.searchsorted(self.t_s, t_s - _HALF_NS, side="left")
+
+
+def moves(values: FloatArray) -> bool:
+    """Whether a channel moves by more than the rounding of its values.
+
+    Args:
+        values: Finite values, shape (n,).
+    """
+    if not values.size:
+        return False
+    return float(np.ptp(values)) > STILL * max(1.0, float(np.max(np.abs(values))))
 
 
 def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Series:

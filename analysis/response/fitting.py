@@ -14,7 +14,8 @@ from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
 from ..estimators.trends import Trend
-from ..results.answer import Lacking, Note, distinct, percent
+from ..estimators.turning import turning_beside_others
+from ..results.answer import Lacking, Note, Refusal, distinct, percent
 from ..results.estimate import Estimate
 from .changes import (
     LEAST_CYCLES,
@@ -47,6 +48,7 @@ from .rhythm import (
     driven,
     find_rhythm,
 )
+from .without_gait import few_cycles, too_seldom, why_no_gait
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""
@@ -134,6 +136,7 @@ def fit_gait(
     Returns:
         The fit, or None, with a warning that says why, where there is no gait.
     """
+    commands = _swinging(commands, warn)
     known = list((commands or responses).values())
     kind = "commands" if commands else "responses"
     if commands:
@@ -142,7 +145,7 @@ def fit_gait(
         rhythm = find_rhythm(known, duration_s)
         found = None if rhythm is None else Groups((rhythm,), rhythm.explained)
     if found is None or found.explained < MIN_EXPLAINED:
-        warn(Lacking(_no_gait(known, found, kind, duration_s)))
+        _warn_no_gait(known, found, kind, duration_s, warn)
         return None
     if not commands:
         return _responses_only(responses, found.rhythms[0])
@@ -158,6 +161,24 @@ def fit_gait(
         _group_fit(group, fit, amplitudes, warn) for group, fit in zip(channels, fits, strict=True)
     ]
     return replace(groups[0], others=tuple(groups[1:]))
+
+
+def _swinging(commands: Mapping[str, Series], warn: Warn) -> Mapping[str, Series]:
+    """Return the commands without those that turn without end beside others."""
+    turning = turning_beside_others({name: one.values for name, one in commands.items()})
+    if turning:
+        turn = "turns" if len(turning) == 1 else "turn"
+        warn(Note(f"{', '.join(turning)} {turn} without end: gain and lag are null"))
+    return {name: one for name, one in commands.items() if name not in turning}
+
+
+def _warn_no_gait(
+    known: Sequence[Series], found: Groups | None, kind: str, duration_s: float, warn: Warn
+) -> None:
+    """Say why there is no gait; the answer begins with it where the record is to blame."""
+    unusable = too_seldom(known) or few_cycles(known, duration_s)
+    text = why_no_gait(known, found, kind, duration_s, unusable)
+    warn(Lacking(text) if unusable is None else Refusal(text))
 
 
 def _select(
@@ -439,22 +460,3 @@ def _mixed(tone: MixedTone, names: Sequence[str]) -> str:
         sign = (" - " if factor < 0 else " + ") if text else ""
         text += f"{sign}{size}"
     return f"{text} falls on {names[tone.group]}"
-
-
-def _no_gait(known: list[Series], found: Groups | None, kind: str, duration_s: float) -> str:
-    nulls = "gain, lag and frequency are null"
-    if not known or all(one.count < 2 or np.ptp(one.values) == 0 for one in known):
-        return f"no gait: the {kind} never move; {nulls}"
-    if found is None:
-        return (
-            f"no gait: not periodic: no rhythm of at least {MIN_CYCLES:g} cycles can be told from "
-            f"the {kind} in {duration_s:.3g} s; {nulls}"
-        )
-    frequencies = ", ".join(f"{one.omega / (2 * np.pi):.3g} Hz" for one in found.rhythms)
-    one = len(found.rhythms) == 1
-    return (
-        f"no gait: the best rhythm{'' if one else 's'} ({frequencies}) explain{'s' if one else ''} "
-        f"{percent(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
-        f"gait at least {100 * MIN_EXPLAINED:.0f} %; {nulls} (if only part of the session is a "
-        "gait, choose it with --start and --stop)"
-    )

@@ -19,7 +19,7 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.process import in_threads
 
-from ..estimators.series import Series
+from ..estimators.series import Series, moves
 from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
@@ -90,7 +90,7 @@ def find_excitation(command: Series) -> Excitation | None:
         None where it doesn't move, has fewer than :data:`LEAST_SAMPLES` samples, or has gaps after
         all: longer ones than the time that it covers.
     """
-    if command.count < LEAST_SAMPLES or np.ptp(command.values) == 0:
+    if command.count < LEAST_SAMPLES or not moves(command.values):
         return None
     if command.t_s[-1] - command.t_s[0] > _LONGEST * command.count * command.period_s:
         return None
@@ -223,7 +223,7 @@ def frequency_responses(
     Returns:
         One result a joint, in the order of the commands, of the first :data:`MOST_JOINTS`.
     """
-    moving = (name for name, one in commands.items() if one.count and np.ptp(one.values) > 0)
+    moving = (name for name, one in commands.items() if moves(one.values))
     answered = (name for name in moving if name in responses and responses[name].count)
     known = list(islice(answered, MOST_JOINTS))
     if next(answered, None) is not None:
@@ -232,7 +232,7 @@ def frequency_responses(
 
     def of_joint(name: str) -> JointFrequencyResponse | None:
         external = (references or {}).get(name)
-        if external is not None and not (external.count and np.ptp(external.values) > 0):
+        if external is not None and not moves(external.values):
             external = None
         known_series = [commands[name], responses[name], *([] if external is None else [external])]
         command, response, *reference = _unbroken(known_series)

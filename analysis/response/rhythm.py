@@ -18,7 +18,7 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at, fit_shared
-from ..estimators.series import Series
+from ..estimators.series import Series, moves
 
 MIN_CYCLES = 3.0
 MIN_EXPLAINED = 0.8
@@ -75,10 +75,10 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [one for one in series if one.count > MIN_SAMPLES and np.ptp(one.values) > 0]
+    moving = [one for one in series if one.count > MIN_SAMPLES and moves(one.values)]
     if not moving or duration_s <= 0:
         return None
-    scouts = _liveliest(moving)
+    scouts = liveliest(moving)
     peak = _periodogram_peak(scouts, duration_s)
     best: Rhythm | None = None
     # A second harmonic that is stronger than the fundamental makes the peak an octave too high.
@@ -159,10 +159,11 @@ def refine(series: Sequence[Series], omega: float) -> Rhythm | None:
     Returns:
         The rhythm; None where the samples are too few or no frequency fits.
     """
-    return _refined(_liveliest(series), series, omega)
+    return _refined(liveliest(series), series, omega)
 
 
-def _liveliest(series: Sequence[Series]) -> list[Series]:
+def liveliest(series: Sequence[Series]) -> list[Series]:
+    """Return the few channels that move most, from which a frequency is found."""
     return sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
 
 

@@ -11,8 +11,9 @@ apply.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 _MOST = 12
@@ -75,6 +76,18 @@ class Lacking(str):
     __slots__ = ()
 
 
+class Leading(Lacking):
+    """A :class:`Lacking` that the answer begins with: the record itself can't show it."""
+
+    __slots__ = ()
+
+
+class Refusal(Leading):
+    """A :class:`Leading` for which no response of any kind can be told from the record."""
+
+    __slots__ = ()
+
+
 class Note(str):
     """A fact; nothing that the result states is doubtful for it."""
 
@@ -109,6 +122,17 @@ class Remarks:
         lacking = [one for one in every if isinstance(one, Lacking)]
         others = [one for one in every if not isinstance(one, (Lacking, Note))]
         return tuple(map(str, dict.fromkeys([*lacking, *of_the_file, *others])))
+
+    @property
+    def leading(self) -> tuple[str, ...]:
+        """What the answer begins with; refusals alone if there are any."""
+        kind = Refusal if self.refused else Leading
+        return tuple(str(one) for one in self._sentences.values() if isinstance(one, kind))
+
+    @property
+    def refused(self) -> bool:
+        """Whether there is a :class:`Refusal`."""
+        return any(isinstance(one, Refusal) for one in self._sentences.values())
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -218,6 +242,29 @@ class Answer:
     alike: bool | None = None
     compared: int = 0
     commanded: int = 0
+
+
+def led(answer: Answer, leading: Sequence[str]) -> Answer:
+    """Begin an answer with what the record itself can't show.
+
+    Args:
+        leading: Of :attr:`Remarks.leading`: clauses up to the first semicolon or bracket are said.
+
+    Returns:
+        The answer; what it says of joints follows, and a sentence that there is nothing to compare
+        is replaced.
+    """
+    if not leading:
+        return answer
+    parts = [_first_clause(text) for text in leading]
+    if answer.verdict is not Verdict.NOTHING or answer.not_following:
+        parts.append(answer.sentence)
+    return replace(answer, sentence=" ".join(parts))
+
+
+def _first_clause(text: str) -> str:
+    clause = re.split(r"; | \(", text.removeprefix("no gait: "))[0]
+    return f"{clause[:1].upper()}{clause[1:]}{'' if clause.endswith('...') else '.'}"
 
 
 EITHER = "stick or play, not separable"

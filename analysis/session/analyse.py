@@ -29,7 +29,7 @@ from ..response.fitting import GaitFit, fit_gait
 from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, JointResult, SessionFacts
-from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint
+from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint, led
 from ..results.body import BodyResult, GroundContact
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
@@ -177,7 +177,7 @@ def measure_session(
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     swept = (
         ()
-        if gait is not None
+        if gait is not None or warn.refused
         else frequency_responses(
             *(commands, sound, warn), _series(columns.names, columns.excitation, stretch, origin_ns)
         )
@@ -254,7 +254,7 @@ def measure_session(
         left_out=left_out,
         motion=analysis.free_motion,
     )
-    analysis = dataclasses.replace(analysis, answer=compose(facts))
+    analysis = dataclasses.replace(analysis, answer=led(compose(facts), warn.leading))
     return SessionMeasurement(
         *(analysis, gait, sound, energies, span, follows.offsets),
         motion=None if columns.command else body.measured.motion,

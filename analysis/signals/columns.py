@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from undulog.capture import SessionView
+from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.find import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
+from undulog.capture.log.read.pauses import without_pauses
 from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
+from ..estimators.turning import turning_beside_others
 from ..response.rhythm import DRIVEN_SHARE
-from ..results.answer import Lacking, Note
+from ..results.answer import Lacking, Leading, Note
 
 DRAG_RATIO = 10.0
 """K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""
@@ -66,14 +70,24 @@ class Columns:
         signals: Mapping[str, Signal] = getattr(self, quantity)
         return signals
 
+    @cached_property
+    def turning(self) -> frozenset[str]:
+        """Joints whose command turns without end, beside others that swing."""
+        return frozenset(turning_beside_others(self._usable_commands))
+
+    @cached_property
+    def _usable_commands(self) -> dict[str, FloatArray]:
+        usable = {n: s.values[np.abs(s.values) <= LARGEST] for n, s in self.command.items()}
+        return {name: values for name, values in usable.items() if values.size}
+
     def commanded(self) -> tuple[str, ...]:
-        """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest."""
-        swing: dict[str, float] = {}
-        for name, signal in self.command.items():
-            usable = signal.values[np.abs(signal.values) <= LARGEST]
-            if usable.size:
-                swing[name] = float(np.ptp(usable))
-        least = DRIVEN_SHARE * max(swing.values(), default=0.0)
+        """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest.
+
+        Joints that turn without end are among them, and no measure for the others.
+        """
+        swing = {name: float(np.ptp(values)) for name, values in self._usable_commands.items()}
+        swings = (size for name, size in swing.items() if name not in self.turning)
+        least = DRIVEN_SHARE * max(swings, default=0.0)
         return tuple(name for name in self.names if swing.get(name, 0.0) > least)
 
 
@@ -141,6 +155,10 @@ def read_columns(
             named = f" (other joints: {', '.join(topics.others)}; choose with {option})"
             logged = "no command logged: " if key == "command" else ""
             nulls = f"gain and lag are null{named if topics.others else ''}"
+            if key == "command" and topics.unnamed:
+                why = " and ".join(topics.unnamed)
+                warn(Leading(f"no commands of named joints: {why}; gain and lag are null"))
+                continue
             warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
@@ -160,6 +178,7 @@ def read_columns(
         key: {name: signals.signal(name) for name in signals.names}
         for key, signals in found.items()
     }
+    _leave_out_pauses(by_name, response_topic, session.start_ns, warn)
     absent: dict[str, Signal] = {}
     return Columns(
         names=tuple(seen),
@@ -167,6 +186,28 @@ def read_columns(
         powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
         topics={key: wanted[key][0] for key in found},
         excitation=by_name.get("excitation", absent),
+    )
+
+
+def _leave_out_pauses(
+    by_name: dict[str, dict[str, Signal]], topic: str, start_ns: int, warn: Warn
+) -> None:
+    """Leave out of the measured quantities what a driver repeats while its bus is silent."""
+    measured = [key for key in ("position", "velocity", "effort") if key in by_name]
+    if "position" not in measured:
+        return
+    commands = by_name.get("command", {})
+    pauses_ns, thinned = without_pauses(commands, *(by_name[key] for key in measured))
+    if not len(pauses_ns):
+        return
+    by_name.update(zip(measured, thinned, strict=True))
+    lasted_s = (pauses_ns[:, 1] - pauses_ns[:, 0]) / NS
+    longest = int(lasted_s.argmax())
+    since_s = (int(pauses_ns[longest, 0]) - start_ns) / NS
+    pauses = "1 pause" if len(pauses_ns) == 1 else f"{len(pauses_ns)} pauses"
+    warn(
+        f"{topic}: all joints repeat their values together for {lasted_s.sum():.3g} s, in {pauses} "
+        f"(the longest from {since_s:.3g} s on): the bus or its driver paused; left out"
     )
 
 

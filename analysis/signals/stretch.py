@@ -16,8 +16,9 @@ from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
 from ..estimators.series import clean
-from ..response.rhythm import MIN_CYCLES
-from ..results.answer import Note
+from ..response.groups import find_groups
+from ..response.rhythm import MIN_CYCLES, MIN_EXPLAINED
+from ..results.answer import Leading, Note
 from .columns import QUANTITIES, Columns
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
@@ -150,14 +151,33 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
             "analysed as if it were steady"
         )
     later = settled(chosen, session.start_ns, settle_s)
-    if later.duration_s < _WORTH_IT * chosen.duration_s:
+    if _too_short(columns, chosen, later):
         warn(
-            f"next to nothing is left after the settling time of {settle_s:g} s: all of it is "
-            "analysed, unsettled as it is"
+            Leading(
+                f"too short: {later.duration_s:.3g} of {chosen.duration_s:.3g} s are left after "
+                f"the settling time of {settle_s:g} s; all of it is analysed, unsettled as it is"
+            )
         )
         later = chosen
     stated = settle_s > 0 or GAIT_TOPIC in session.channels
     return _in_motion(columns, later, options, warn, stated=stated)
+
+
+def _too_short(columns: Columns, chosen: Stretch, later: Stretch) -> bool:
+    """Whether what is left after the settling time is next to nothing, or loses the gait."""
+    if later.duration_s < _WORTH_IT * chosen.duration_s:
+        return True
+    return later != chosen and not _has_gait(columns, later) and _has_gait(columns, chosen)
+
+
+def _has_gait(columns: Columns, stretch: Stretch) -> bool:
+    series = [
+        clean(name, signal.t_ns, signal.values, stretch.start_ns).between(0.0, stretch.duration_s)
+        for name, signal in columns.command.items()
+        if name not in columns.turning
+    ]
+    found = find_groups(series, stretch.duration_s)
+    return found is not None and found.explained >= MIN_EXPLAINED
 
 
 def fetched_part(session: SessionView, options: Options, warn: Warn) -> SessionView:
@@ -247,6 +267,7 @@ def _in_motion(
     series = [
         clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
         for name, signal in columns.command.items()
+        if name not in columns.turning
     ]
     span = moving(series)
     if span is None:

@@ -19,6 +19,7 @@ from ..file.log_file import FilePages
 from ..mcap.chunk import Places
 from ..messages.cdr import Layout, Leaf
 from .buffers import ColumnStore, Times, TimeStore
+from .names import distinct_names
 
 MOST_LAYOUTS = 64
 MOST_JOINT_LISTS = 256
@@ -131,8 +132,13 @@ def _fits(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
 
 
 def names_of(layout: Layout, sequence: str = "name[") -> tuple[str, ...]:
-    """Return the strings of a sequence; by default ``name``, the joints of a JointState."""
-    return tuple(text for path, text in layout.strings.items() if path.startswith(sequence))
+    """Return the strings of a sequence, each of them once: see :mod:`.names`.
+
+    Args:
+        sequence: By default ``name``, the joints of a JointState.
+    """
+    given = [text for path, text in layout.strings.items() if path.startswith(sequence)]
+    return distinct_names(given)
 
 
 def values_of(layout: Layout, path: str, matrix: Matrix) -> NDArray[Any]:

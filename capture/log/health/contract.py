@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from ...common.errors import DataError, some_names
 from ...common.process import threads_or_default
 from ...common.remote import as_path
+from ..columns.names import several_of_one_name
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
@@ -273,6 +274,9 @@ def _names(view: SessionView, topic: str) -> Iterator[Violation]:
     if len(orders) > 1:
         fix = "write the same names in each message, NaN for a joint without a value"
         yield Violation("names", f"{topic}: name", f"{len(orders)} different lists", fix)
+    for name in dict.fromkeys(name for order in orders for name in several_of_one_name(order)):
+        fix = "give each joint a name of its own"
+        yield Violation("names", f"{topic}: name", f"{name} more than once", fix)
     robot = view.robot
     if robot is None or not orders:
         return

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
+from ..columns.names import one_name_sentences
 from ..messages import COMMAND_TOPIC
 from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
@@ -233,7 +234,7 @@ def has_rhythm(topic: str) -> bool:
 def judge_series(
     health: SeriesHealth, start_ns: int, end_ns: int, commands_ns: int | None = None
 ) -> Iterator[Fault]:
-    """Yield what is wrong with the rhythm of one series.
+    """Yield what is wrong with the names and the rhythm of one series.
 
     Args:
         start_ns: Log time of the session's first message [Unix ns].
@@ -243,6 +244,8 @@ def judge_series(
     Yields:
         The faults; none for view aids and for the recorder's own topics.
     """
+    for sentence in one_name_sentences([health.names]):
+        yield Fault(1, health.topic, "", f"{sentence}; give each its name")
     timing, label = health.timing, health.label
     if timing.median_s is None or not has_rhythm(health.topic):
         return
@@ -332,29 +335,60 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[Fault
         joints: Measures of all joints of all topics.
         start_ns: Start of the session [Unix ns].
     """
+    together = {topic for topic, same in _by_topic(joints).items() if _paused(same)}
+    for topic in together:
+        first = next(joint for joint in joints if joint.topic == topic and _is_frozen(joint))
+        when = _at(first.frozen_at_ns, start_ns)
+        text = f"all joints repeat their values for {first.frozen_s} s while their commands move, "
+        yield Fault(1, topic, "", f"{text}{when}: the bus, its driver or the robot paused")
     for joint in joints:
-        for weight, text in _joint_faults(joint, start_ns):
+        for weight, text in _joint_faults(joint, start_ns, alone=joint.topic not in together):
             yield Fault(weight, joint.topic, joint.name, text)
 
 
-def _joint_faults(joint: JointHealth, start_ns: int) -> Iterator[tuple[int, str]]:
+def _by_topic(joints: Iterable[JointHealth]) -> dict[str, list[JointHealth]]:
+    topics: dict[str, list[JointHealth]] = {}
+    for joint in joints:
+        topics.setdefault(joint.topic, []).append(joint)
+    return topics
+
+
+def _paused(joints: Iterable[JointHealth]) -> bool:
+    """Whether all commanded joints of a topic froze in the same seconds: no joint did it."""
+    commanded = [joint for joint in joints if joint.frozen_s is not None]
+    if len(commanded) < 2 or not all(map(_is_frozen, commanded)):
+        return False
+    begin = max(joint.frozen_at_ns for joint in commanded)
+    end = min(joint.frozen_at_ns + (joint.frozen_s or 0) * NS for joint in commanded)
+    longest_s = max(joint.frozen_s or 0 for joint in commanded)
+    return 2 * (end - begin) > longest_s * NS
+
+
+def _joint_faults(joint: JointHealth, start_ns: int, *, alone: bool) -> Iterator[tuple[int, str]]:
     if joint.nan:
         weight = int(joint.nan > GOOD_LOSS * joint.samples)
         yield weight, f"{joint.nan} of {joint.samples} samples are not a number"
-    if _is_frozen(joint):
+    if alone and _is_frozen(joint):
         when = _at(joint.frozen_at_ns, start_ns)
         yield 1, f"frozen for {joint.frozen_s} s while its command moved, {when}"
     if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
         yield 1, f"at the robot's limits in {joint.at_limit:.0%} of the samples"
 
 
-def judge_body(measured: Sequence[JointHealth]) -> Iterator[Finding]:
-    """Yield findings on all measured joints together."""
+def judge_body(measured: Sequence[JointHealth], lasted_s: float) -> Iterator[Finding]:
+    """Yield findings on all measured joints together.
+
+    Args:
+        lasted_s: How long the session lasted [s]; a pause of less than :data:`BAD_PAUSE` of it that
+            all joints share counts as no joint that is dead.
+    """
     names = {joint.name for joint in measured}
+    longest_s = max((joint.frozen_s or 0 for joint in measured), default=0)
+    paused = _paused(measured) and longest_s < BAD_PAUSE * lasted_s
     dead = {
         joint.name
         for joint in measured
-        if _is_frozen(joint) or joint.nan > BAD_LOSS * joint.samples
+        if (_is_frozen(joint) and not paused) or joint.nan > BAD_LOSS * joint.samples
     }
     if len(names) > 1 and len(dead) >= BAD_JOINTS * len(names):
         yield Finding(2, f"{len(dead)} of {len(names)} joints are frozen or missing")

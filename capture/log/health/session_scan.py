@@ -228,7 +228,8 @@ class SessionScan:
             if each.topic not in framed:
                 faults += judge_series(each, start_ns, end_ns, commands_ns)
         findings += joined([*faults, *judge_joints(joints, start_ns)])
-        findings += judge_body([joint for joint in joints if joint.topic == self._states])
+        states = [joint for joint in joints if joint.topic == self._states]
+        findings += judge_body(states, (end_ns - start_ns) / NS)
         for bus in buses:
             findings += judge_bus(bus)
         findings += judge_silences(buses, start_ns)

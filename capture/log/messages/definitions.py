@@ -205,7 +205,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
 DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
+FLOAT_ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
+"""Values without names and without a stamp."""
 
 JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE)
 """Types whose messages each have one sample of some joints, and their names."""

@@ -20,11 +20,12 @@ import numpy as np
 from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
 from ..columns.layouts import Group, names_of
+from ..columns.names import distinct_names, one_name_sentences
 from ..messages.cdr import LITTLE_ENDIAN_HEADER, Layout
 from ..messages.definitions import (
     CONTROLLER_STATE,
     DYNAMIC_STATE,
-    FLOAT_ARRAY,
+    FLOAT_ARRAYS,
     JOINT_LISTS,
     JOINT_STATE,
     TRAJECTORY,
@@ -32,7 +33,7 @@ from ..messages.definitions import (
     MessageType,
 )
 
-JOINT_TYPES = (*JOINT_LISTS, FLOAT_ARRAY, TRAJECTORY)
+JOINT_TYPES = (*JOINT_LISTS, *FLOAT_ARRAYS, TRAJECTORY)
 """Types that hold joints."""
 
 COMMAND_PARTS = ("reference", "desired", "output")
@@ -91,7 +92,7 @@ def leaf_paths(source: JointSource, type_name: str, fields: Iterable[str]) -> li
         return [f"{source.part}.{_POINT_FIELDS[field]}" for field in fields]
     if type_name == DYNAMIC_STATE:
         return None
-    return ["data"] if type_name == FLOAT_ARRAY else list(fields)
+    return ["data"] if type_name in FLOAT_ARRAYS else list(fields)
 
 
 def check_source(source: JointSource, kind: MessageType) -> None:
@@ -115,20 +116,21 @@ def check_source(source: JointSource, kind: MessageType) -> None:
             )
     elif source.part and kind.name != DYNAMIC_STATE:
         raise DataError(f"{topic} is {kind.name}, which has no part {source.part!r}")
-    if kind.name == FLOAT_ARRAY and not source.joints:
+    if kind.name in FLOAT_ARRAYS and not source.joints:
         raise DataError(
             f"{topic} is {kind.name}, whose values have no names: name its joints in their order, "
             f"{topic}:JOINT,JOINT,..."
         )
-    if kind.name != FLOAT_ARRAY and source.joints:
+    if kind.name not in FLOAT_ARRAYS and source.joints:
         raise DataError(f"{topic} is {kind.name}, which names its joints itself")
 
 
 def is_of_joints(kind: MessageType) -> bool:
     """Whether a type has the fields of its name that are read."""
     fields = {field.name: field for field in kind.fields}
-    if kind.name == FLOAT_ARRAY:
-        return "data" in fields and fields["data"].base == "float64" and fields["data"].is_array
+    if kind.name in FLOAT_ARRAYS:
+        data = fields.get("data")
+        return data is not None and data.is_array and data.base in ("float64", "float32")
     stamp = _parts(_parts(fields.get("header")).get("stamp"))
     if not {"sec", "nanosec"} <= stamp.keys():
         return False
@@ -172,7 +174,7 @@ def sampled(
         names, values = names_of(group.layout, _JOINTS), group.values(path)
     elif type_name == DYNAMIC_STATE:
         names, values = _interface(group, source.part, field)
-    elif type_name == FLOAT_ARRAY:
+    elif type_name in FLOAT_ARRAYS:
         names, values = source.joints, group.values("data")
         if field != "position":
             values = values[:, :0]
@@ -227,7 +229,7 @@ def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tu
             field: tuple(name for name, there in own if interface in there)
             for field, interface in wanted.items()
         }
-    elif type_name == FLOAT_ARRAY:
+    elif type_name in FLOAT_ARRAYS:
         found = {"position": source.joints if "data" in leaves else ()}
     elif type_name == CONTROLLER_STATE:
         names = names_of(layout, _JOINTS)
@@ -300,7 +302,7 @@ def read_trajectory(log_ns: int, message: bytes) -> Trajectory:
         raise DataError(f"encapsulation {message[:2].hex()} is not little-endian CDR")
     cursor = _Cursor(message)
     stamp_ns, _ = cursor.time_ns(), cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
+    names = distinct_names([cursor.text() for _ in range(cursor.count())])
     count = cursor.count()
     if count > _MOST_POINTS:
         raise DataError(f"a trajectory of {count} points can't be right")
@@ -428,6 +430,8 @@ def merge_rows(
                 f"{topic}: {len(row.stamp_ns)} messages have {len(row.names)} names but "
                 f"{row.values.shape[1]} values of {field}; they are left out"
             )
+    for sentence in one_name_sentences(row.names for row in filled):
+        warn(f"{topic}: {sentence}")
     if len(filled) == 1:
         row = filled[0]
         t_ns, order = _in_time(row.stamp_ns, f"{topic}", warn)

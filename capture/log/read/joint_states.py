@@ -16,8 +16,9 @@ from ...common.arrays import NS, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
+from ..columns.names import distinct_names, one_name_sentences
 from ..columns.topics import Channel, Topics
-from ..messages.definitions import FLOAT_ARRAY, JOINT_STATE, TRAJECTORY
+from ..messages.definitions import FLOAT_ARRAYS, JOINT_STATE, TRAJECTORY
 from .joint_messages import (
     INTERFACE_UNITS,
     UNITS,
@@ -202,7 +203,11 @@ class JointReader:
         """
         found = self._topics.read(self.requests(wanted), window_ns)
         keys = [(name, field) for name, fields in wanted.items() for field in fields]
-        return {key: self._rows(*key, found) for key in keys}
+        rows = {key: self._rows(*key, found) for key in keys}
+        for (name, _), several in rows.items():
+            for sentence in one_name_sentences(row.names for row in several):
+                self._warn(f"{name}: {sentence}")
+        return rows
 
     def signals(
         self,
@@ -330,7 +335,7 @@ class JointReader:
         except DataError as error:
             raise DataError(f"{self._path}: {error}") from None
         rows.extend(self._general_rows(source, kind, field, messages))
-        if kind == FLOAT_ARRAY:  # whose times are the log's already
+        if kind in FLOAT_ARRAYS:  # whose times are the log's already
             return rows
         return [self._on_log_clock(row, source.topic) for row in rows]
 
@@ -406,7 +411,7 @@ class JointReader:
             stamp_ns = int(stamp.sec) * NS + int(stamp.nanosec)
             values = np.array([getattr(message, field)], dtype=np.float64)
             times = np.array([stamp_ns]), np.array([item.log_ns])
-            rows.append(JointRows(tuple(message.name), *times, values))
+            rows.append(JointRows(distinct_names(message.name), *times, values))
         if lost:
             self._warn(f"{source.topic}: {lost} messages can't be read: {found.unread[0].why}")
         return rows

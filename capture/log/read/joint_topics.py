@@ -11,17 +11,19 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from ...common.errors import DataError, JointSetError, MissingChannelError, some_names
+from ..columns.names import distinct_names
 from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import (
     CONTROLLER_STATE,
     DYNAMIC_STATE,
-    FLOAT_ARRAY,
+    FLOAT_ARRAYS,
     JOINT_STATE,
     TRAJECTORY,
     PowerTopic,
@@ -96,9 +98,12 @@ def _of_joints(topics: Topics) -> list[str]:
 def _joints(message: Any) -> list[str]:
     """Return the joints of a message; of a DynamicJointState those with a position."""
     if hasattr(message, "interface_values"):
-        pairs = zip(message.joint_names, message.interface_values, strict=False)
+        names = distinct_names(message.joint_names)
+        pairs = zip(names, message.interface_values, strict=False)
         return [name for name, one in pairs if "position" in one.interface_names]
-    return list(getattr(message, "joint_names", None) or getattr(message, "name", ()))
+    return list(
+        distinct_names(getattr(message, "joint_names", None) or getattr(message, "name", ()))
+    )
 
 
 def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) -> None:
@@ -163,6 +168,7 @@ class JointTopics:
             where the values are.
         others: Other names that could be commands or responses.
         notes: What was found by its type, and interfaces that have no topic in the log contract.
+        unnamed: Why arrays that could be the commands are none, where no other topic is.
     """
 
     command: str = COMMAND_TOPIC
@@ -170,6 +176,7 @@ class JointTopics:
     quantities: Mapping[str, str] = field(default_factory=lambda: _NO_QUANTITIES)
     others: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    unnamed: tuple[str, ...] = ()
 
     @property
     def renamed(self) -> dict[str, str]:
@@ -205,6 +212,12 @@ class JointTopicFinder:
         """
         self._path, self._topics, self._joints = path, topics, tuple(joints)
         self._first: dict[str, bytes] | None = None
+        self._named_after: dict[str, str] = {}
+
+    @cached_property
+    def _every(self) -> dict[str, tuple[str, ...]]:
+        """The joints of each topic that names some."""
+        return joint_names(self._topics)
 
     def find(self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC) -> JointTopics:
         """Find commands and responses.
@@ -226,8 +239,9 @@ class JointTopicFinder:
         response = self._part(response, STATE_PARTS) if response != RESPONSE_TOPIC else response
         quantities, notes = self._quantities()
         if not search:
+            notes = (*self._order_notes(command, response), *notes)
             return JointTopics(command, response, quantities, notes=notes)
-        every = joint_names(self._topics)
+        every = self._every
         commands = _sorted(self._commands(every), response)
         responses = _sorted(self._responses(every), command)
         taken: dict[str, str] = {}
@@ -249,12 +263,15 @@ class JointTopicFinder:
             if own and response == RESPONSE_TOPIC:
                 response = taken["positions"] = own[0].name
         others = [one.name for one in (*commands, *responses)]
-        arrays = [topic for topic, kind, _ in self._joint_topics() if kind == FLOAT_ARRAY]
+        arrays = [topic for topic, kind, _ in self._joint_topics() if kind in FLOAT_ARRAYS]
         taken_topics = {one.topic for one in commands if one.name == command}
         others += [f"{topic}:JOINT,..." for topic in arrays if topic not in taken_topics]
         others = [name for name in dict.fromkeys(others) if name not in (command, response)]
-        notes = (*_notes(taken, others), *notes)
-        return JointTopics(command, response, quantities, tuple(others), notes)
+        notes = (*_notes(taken, others), *self._order_notes(command, response), *notes)
+        unnamed = (
+            self._unnamed(arrays) if command not in channels and "commands" not in taken else ()
+        )
+        return JointTopics(command, response, quantities, tuple(others), notes, unnamed)
 
     def _names_of(self, name: str, every: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
         source = joint_source(name, self._topics.channels)
@@ -271,23 +288,61 @@ class JointTopicFinder:
         if kind == CONTROLLER_STATE and not source.part:
             filled = self._filled(source.topic, parts)
             return f"{name}.{filled[0]}" if filled else name
-        if kind == FLOAT_ARRAY and not source.joints:
+        if kind in FLOAT_ARRAYS and not source.joints:
             return self._named_array(source.topic)
         return name
 
     def _named_array(self, topic: str) -> str:
-        """Return the name of an array's joints, those of the robot."""
+        """Return the name of an array's joints.
+
+        Raises:
+            DataError: If neither the robot nor a topic of joint states has so many.
+        """
+        if joints := self._joints_of(topic):
+            return f"{topic}:{','.join(joints)}"
+        raise DataError(
+            f"{self._path}: {self._lacking_names(topic)} (or --response-topic), or give a robot "
+            "that has so many"
+        )
+
+    def _lacking_names(self, topic: str) -> str:
+        width, joints = self._width(topic), f", the robot {len(self._joints)} joints"
+        kind = self._topics.channels[topic].type_name
+        return (
+            f"{topic}, {kind}, has {width} values without names{joints if self._joints else ''}: "
+            f"name its joints in their order, --command-topic {topic}:JOINT,JOINT,..."
+        )
+
+    def _joints_of(self, topic: str) -> tuple[str, ...]:
+        """Return the joints of an array: the robot's, or those of the states, if as many.
+
+        Names in which a comma would not be one between names are left out.
+        """
         width = self._width(topic)
         if width and width == len(self._joints):
-            return f"{topic}:{','.join(self._joints)}"
-        if self._joints:
-            why = f"{width} values, the robot {len(self._joints)} joints"
-        else:
-            why = f"{width} values without names"
-        option = f"{topic}:JOINT,JOINT,..."
-        raise DataError(
-            f"{self._path}: {topic} ({FLOAT_ARRAY}) has {why}: name its joints in their order, "
-            f"--command-topic {option} (or --response-topic), or give a robot that has so many"
+            return self._joints
+        states = _sorted(self._responses(self._every), topic)
+        named = (one for one in states if len(one.joints) == width > 0)
+        first = next((one for one in named if not any("," in name for name in one.joints)), None)
+        if first is None:
+            return ()
+        self._named_after[topic] = first.name
+        return first.joints
+
+    def _order_notes(self, *chosen: str) -> tuple[str, ...]:
+        """Say whose joints arrays have that name none."""
+        return tuple(
+            f"{topic} names no joints: those of {states} are taken in their order (others: "
+            f"--command-topic {topic}:JOINT,JOINT,...)"
+            for topic, states in self._named_after.items()
+            if any(name.startswith(f"{topic}:") for name in chosen)
+        )
+
+    def _unnamed(self, arrays: Iterable[str]) -> tuple[str, ...]:
+        return tuple(
+            self._lacking_names(topic)
+            for topic in arrays
+            if _of_angles(topic) and self._width(topic) and not self._joints_of(topic)
         )
 
     def _commands(self, every: Mapping[str, tuple[str, ...]]) -> Iterator[_Candidate]:
@@ -296,11 +351,9 @@ class JointTopicFinder:
             if kind == CONTROLLER_STATE:
                 for one in self._filled(topic, COMMAND_PARTS)[:1]:
                     yield _Candidate(f"{topic}.{one}", topic, 0, count, joints)
-            elif kind == FLOAT_ARRAY:
-                of_angles = bool(words & _COMMAND_WORDS) and not words & _NO_ANGLES
-                if of_angles and self._joints and self._width(topic) == len(self._joints):
-                    name = self._named_array(topic)
-                    yield _Candidate(name, topic, 3, count, self._joints)
+            elif kind in FLOAT_ARRAYS:
+                if _of_angles(topic) and (own := self._joints_of(topic)):
+                    yield _Candidate(f"{topic}:{','.join(own)}", topic, 3, count, own)
             elif kind == TRAJECTORY:
                 yield _Candidate(topic, topic, 2, count, joints)
             elif words & _COMMAND_WORDS:
@@ -379,6 +432,12 @@ class JointTopicFinder:
 
 _UNNAMED = 3
 """Rank of a JointState whose name says nothing: taken if it is the only one."""
+
+
+def _of_angles(topic: str) -> bool:
+    """Whether the words of a topic's name are of commanded angles."""
+    words = _words(topic)
+    return bool(words & _COMMAND_WORDS) and not words & _NO_ANGLES
 
 
 def _words(topic: str) -> set[str]:

@@ -14,7 +14,6 @@ from undulog.analysis.response.fitting import (
     GaitFit,
     _mixed,
     _needed,
-    _no_gait,
     _usable,
     _warn_changes,
     _warn_groups,
@@ -23,7 +22,6 @@ from undulog.analysis.response.fitting import (
     fit_gait,
 )
 from undulog.analysis.response.groups import Groups, MixedTone, Unresolved
-from undulog.analysis.response.rhythm import Rhythm
 from undulog.analysis.results.answer import Lacking, Note
 from undulog.analysis.results.estimate import Estimate
 
@@ -223,25 +221,6 @@ def test_mixed_tones_are_named_by_their_frequencies():
     names = ["1 Hz", "2 Hz", "3 Hz"]
     assert _mixed(MixedTone(1, {0: -1, 2: 3}), names) == "3 x 3 Hz - 1 Hz falls on 2 Hz"
     assert _mixed(MixedTone(0, {0: 2, 1: 1}), names) == "2 x 1 Hz + 2 Hz falls on 1 Hz"
-
-
-def test_why_there_is_no_gait():
-    still = [Series("a", T, np.ones(T.size)), Series("b", T[:1], T[:1])]
-    nulls = "gain, lag and frequency are null"
-    assert _no_gait(still, None, "commands", 10.0) == f"no gait: the commands never move; {nulls}"
-    assert _no_gait([], None, "responses", 1.0).startswith("no gait: the responses never move")
-    assert _no_gait([wave("a", t=T[:2])], None, "commands", 12.34) == (
-        "no gait: not periodic: no rhythm of at least 3 cycles can be told from the commands in "
-        f"12.3 s; {nulls}"
-    )
-    rhythm = Rhythm(("a",), fit_at([wave("a")], np.pi))
-    single = _no_gait([wave("a")], Groups((rhythm,), 0.5), "commands", 10.0)
-    assert single.startswith(
-        "no gait: the best rhythm (0.5 Hz) explains 50 % of the commands' variance, a gait at "
-        f"least 80 %; {nulls} (if only"
-    )
-    two = _no_gait([wave("a")], Groups((rhythm, rhythm), -0.5), "commands", 10.0)
-    assert "the best rhythms (0.5 Hz, 0.5 Hz) explain 0 % of" in two
 
 
 def test_what_never_moves_is_named_by_its_kind():

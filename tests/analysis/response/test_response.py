@@ -13,11 +13,11 @@ from undulog.analysis.estimators.spectrum import Noise, ResidualBins
 from undulog.analysis.response.response import Response, gain_estimate, lag_estimate, respond
 from undulog.analysis.response.rhythm import (
     Rhythm,
-    _liveliest,
     _periodogram_peak,
     allowed_model,
     driven,
     find_rhythm,
+    liveliest,
     phase_step,
     refine,
     wave_name,
@@ -150,7 +150,7 @@ def test_channels_that_move_have_the_rhythm_in_their_order():
 
 def test_the_livelier_channels_are_looked_at_first():
     series = [sine(3.0, size=size, name=str(size)) for size in (0.1, 0.5, 0.3, 0.2, 0.4, 0.0)]
-    assert [channel.name for channel in _liveliest(series)] == ["0.5", "0.4", "0.3", "0.2"]
+    assert [channel.name for channel in liveliest(series)] == ["0.5", "0.4", "0.3", "0.2"]
 
 
 @pytest.mark.parametrize("hz", [0.3, 1.7, 20.0, 44.0])
@@ -176,7 +176,7 @@ def test_the_periodogram_has_limits():
     assert coarse == pytest.approx(2 * np.pi * 3.0, abs=0.2)
 
 
-def test_joints_are_driven_from_a_share_of_the_liveliest_on():
+def test_joints_are_driven_from_a_share_of_theliveliest_on():
     series = [sine(3.0), sine(3.0, size=0.011), sine(3.0, size=0.009), Series("n", T, 0 * T)]
     follows, astray = driven(fit_at(series, 3.0))
     assert follows.tolist() == [True, True, False, False]

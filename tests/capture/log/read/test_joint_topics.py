@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.ros_bags import EPOCH_NS, NAMES, filling, message, write_bag
+from support.analysed import analysed
+from support.ros_bags import ARRAY, EPOCH_NS, NAMES, commanded, filling, message, ticks, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.log.read.joint_messages import Trajectory, joint_source, points_in_force
@@ -72,27 +73,91 @@ def test_states_that_could_be_either_are_not_taken(tmp_path):
             session.joint_topics(response="/none")
 
 
-def test_the_array_of_a_robot_has_its_joints(tmp_path):
-    """Three values and a robot of 25 joints: refused; of the same number: taken, and reported."""
+LACKING = (
+    "/forward/commands, std_msgs/msg/Float64MultiArray, has 4 values without names: name its "
+    "joints in their order, --command-topic /forward/commands:JOINT,JOINT,..."
+)
 
-    def fill(own, *tick):
-        own.state(*tick)
-        own.array(*tick)
 
-    robot = tmp_path / "robot.toml"
-    with opened(tmp_path, fill) as session:
-        assert session.joint_topics().command == "/joint_commands"
+def arrays(kind=ARRAY, width=3, topic="/forward/commands", names=NAMES):
+    """States of three joints, and commands without names."""
+
+    def fill(own, t_ns, t_s):
+        own.state(t_ns, t_s, names=names)
+        data = np.resize(commanded(t_s), width).astype("f4" if "32" in kind else "f8")
+        own.bag.write(topic, t_ns, message(own.bag.store, kind, data=data))
+
+    return fill
+
+
+@pytest.mark.parametrize("kind", [ARRAY, "std_msgs/msg/Float32MultiArray"])
+def test_an_array_has_the_joints_of_the_states_if_they_are_as_many(tmp_path, kind):
+    with opened(tmp_path, arrays(kind)) as session:
+        found = session.joint_topics()
+        name = f"/forward/commands:{','.join(NAMES)}"
+        assert (found.command, found.response) == (name, "/joint_states")
+        assert found.notes[1] == (
+            "/forward/commands names no joints: those of /joint_states are taken in their order "
+            "(others: --command-topic /forward/commands:JOINT,JOINT,...)"
+        )
+        assert session.joint_topics("/forward/commands").command == name
+        assert found.notes[1] in session.joint_topics("/forward/commands").notes
+        signals = session.with_joints().joints("/joint_commands")
+        assert signals.names == NAMES
+        expected = [commanded(t_s) for _, t_s in ticks(0.2)]
+        assert np.stack(signals.values, axis=1) == pytest.approx(np.array(expected), abs=1e-7)
+        other = session.joint_topics("/forward/commands:c,b,a")
+        assert (other.command, other.notes) == ("/forward/commands:c,b,a", ())
+
+
+def test_an_array_has_the_joints_of_the_robot_before_those_of_the_states(tmp_path):
+    with opened(tmp_path, arrays(names=NAMES[::-1])) as session:
         path = session.path
     from undulog import run
 
+    robot = tmp_path / "robot.toml"
     assert run(["robot", "new", "-o", str(robot), "--from", str(path)]) == 0
     with Session.open(path, robot=robot) as session:
         found = session.joint_topics()
-        assert found.command == f"/forward/commands:{','.join(NAMES)}"
-        assert (
-            "commands on /forward/commands:front_yaw,mid_yaw,rear_yaw, found by" in found.notes[0]
-        )
-        assert session.with_joints().joints("/joint_commands").names == NAMES
+        joints = session.robot.joint_names
+        assert set(joints) == set(NAMES)
+        assert found.command == f"/forward/commands:{','.join(joints)}"
+        assert not [note for note in found.notes if "names no joints" in note]
+
+
+@pytest.mark.parametrize(
+    ("fill", "unnamed"),
+    [
+        (
+            arrays(width=4),
+            (LACKING,),
+        ),
+        (arrays(names=("a", "b,c", "d")), None),
+        (arrays(topic="/velocity_controller/commands"), ()),
+        (arrays(topic="/forward/values"), ()),
+    ],
+)
+def test_an_array_whose_joints_are_unknown_is_not_guessed(tmp_path, fill, unnamed):
+    with opened(tmp_path, fill) as session:
+        found = session.joint_topics()
+        assert found.command == "/joint_commands"
+        assert len(found.unnamed) == 1 if unnamed is None else found.unnamed == unnamed
+
+
+def test_an_array_that_was_chosen_without_its_joints_is_refused_with_the_option(tmp_path):
+    with (
+        opened(tmp_path, arrays(width=4)) as session,
+        pytest.raises(DataError, match=r"has 4 values without names: name its joints in their or"),
+    ):
+        session.joint_topics("/forward/commands")
+
+
+def test_the_answer_names_the_array_and_the_option(tmp_path):
+    named = analysed(write_bag(tmp_path / "named", filling(arrays())))
+    gains = [joint.gain.value for joint in named.joints]
+    assert gains == pytest.approx([0.95, 0.9, 0.85], abs=2e-3)
+    result = analysed(write_bag(tmp_path / "bag", filling(arrays(width=4))))
+    assert result.answer.sentence == f"No commands of named joints: {LACKING}"
 
 
 def test_names_without_joints_are_refused(tmp_path):
