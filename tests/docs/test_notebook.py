@@ -26,7 +26,7 @@ def test_a_cell_shows_what_it_prints_and_its_last_expression():
     assert run_cell("", names) == ("", None)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_notebook_runs_says_what_its_text_says_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     page = notebook_page.executed_page()

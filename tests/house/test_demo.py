@@ -1,6 +1,7 @@
 """The main job end to end, on the files that `make demo` makes, held by foreign tools."""
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -17,8 +18,15 @@ JOINTS = [f"joint{i:02d}" for i in range(1, 26)]
 pytestmark = pytest.mark.slow
 
 
+MADE = "UNDULOG_DEMO"
+"""Environment variable: a folder below the root in which `make demo` of this tree has just been."""
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
+    """What `make demo` has made, or makes: the folder."""
+    if made := os.environ.get(MADE):
+        return ROOT / made
     folder = tmp_path_factory.mktemp("demo")
     recipe = re.findall(r"\$\(call undulog,(.*)\)\n", (ROOT / "Makefile").read_text())
     assert len(recipe) == 4

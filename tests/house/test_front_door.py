@@ -122,7 +122,7 @@ def test_a_closed_pipe_is_no_traceback():
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     trace, session = tmp_path / "trace.mf4", tmp_path / "trace.mcap"
@@ -141,7 +141,10 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", ["--help", "info --json", "sim list"])
+@pytest.mark.parametrize(
+    "words",
+    ["--help", *(pytest.param(w, marks=pytest.mark.nightly) for w in ("info --json", "sim list"))],
+)
 def test_a_full_device_behind_the_output_is_an_error(words):
     with Path("/dev/full").open("w") as full:
         done = processes.undulog(*words.split(), cwd=ROOT, stdout=full)

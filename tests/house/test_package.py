@@ -50,7 +50,7 @@ def wheel(tree):
     return next((tree.parent / "wheel").glob("*.whl"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree, wheel):
     run(*BUILD, "-t", "sdist", "-d", tree.parent / "sdist", cwd=tree)
     with tarfile.open(next((tree.parent / "sdist").glob("*.tar.gz"))) as archive:

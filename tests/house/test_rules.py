@@ -21,7 +21,7 @@ def test_no_recording_or_output_is_tracked_but_those_that_tests_are_held_to():
     assert recordings == ["tests/replay/golden/session.mcap"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_bench_finds_what_it_imports():
     names = sorted(path.stem for path in (ROOT / "bench").glob("*.py"))
     assert "twin_step" in names

@@ -162,7 +162,14 @@ def test_json_is_one_value_and_keeps_the_names(run, command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["analyse A", "compare A B", "log export A -o pty.csv"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "analyse A",
+        pytest.param("compare A B", marks=pytest.mark.nightly),
+        "log export A -o pty.csv",
+    ],
+)
 def test_a_terminal_gets_styles_and_progress_only(folder, command):
     (folder / "pty.csv").unlink(missing_ok=True)
     ours, theirs = pty.openpty()

@@ -158,7 +158,7 @@ def test_a_session_without_a_body_says_what_it_takes(write, command, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_gif_shows_the_gait(session_file, vulkan, report_of, tmp_path):
     clip = tmp_path / "a.gif"
     part = ("--from", 0.4, "--to", 2.8, "--fps", 5, "--size", "480x300")

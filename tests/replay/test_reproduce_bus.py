@@ -27,7 +27,7 @@ def recorded(tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, report_of):
     path = tmp_path / "again.mcap"
     with served("weak-servo-pi3", "--duration", "60") as on:

@@ -107,7 +107,7 @@ def test_a_short_session_arrives_as_it_is_saved(receive, session_file, analysis,
     assert "analysed:" not in facts[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, tmp_path, read_back):
     notes, received = receive(long_file)
     with Session.open(long_file) as session:
@@ -137,7 +137,9 @@ def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("late", ["heat_from_s", "last_from_s"])
+@pytest.mark.parametrize(
+    "late", [pytest.param("heat_from_s", marks=pytest.mark.nightly), "last_from_s"]
+)
 def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long, tmp_path, late):
     from_s = 365  # in a stretch that it doesn't look into
     file = write_long(tmp_path / "late.mcap", **{late: from_s})
@@ -154,7 +156,7 @@ def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long
     assert at_s.max() == LONG_S - 1 / RATE_HZ
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_odometry_the_body_is_drawn_throughout(
     receive, write_long, tmp_path, read_back, opened
 ):

@@ -145,7 +145,7 @@ def test_a_file_that_no_stream_was_connected_to_is_empty(tmp_path):
     assert (tmp_path / "draft").read_bytes() == b""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_command_without_room_for_its_file_ends_with_a_sentence(session_file, tmp_path):
     words = f"ulimit -f 8; exec {sys.executable} -m undulog view '{session_file}' --save run.rrd"
     done = run("bash", "-c", words, cwd=tmp_path, code=1)

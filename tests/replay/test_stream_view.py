@@ -131,6 +131,7 @@ def viewer_of(shown):
     return next(one for one, line in arguments.items() if b"--headless" in line)
 
 
+@pytest.mark.nightly
 def test_the_body_comes_first_and_whoever_looks_keeps_his_place(view, long_file, rgb):
     shown = view(long_file)
     body = until_the_body_stands(shown, rgb)
@@ -159,6 +160,7 @@ def test_a_tab_that_was_asked_for_comes_to_the_front_with_its_numbers(view, long
     assert shown.picture(rgb, name).std() > 5  # a view behind a tab has no picture
 
 
+@pytest.mark.nightly
 def test_closing_the_window_while_it_is_converted_ends_the_command(shown):
     shown.client.run_command("ui.quit")
     assert shown.finish() == (0, "", "")

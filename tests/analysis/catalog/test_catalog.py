@@ -336,7 +336,7 @@ def test_the_command(lab, command, report_of):
     command("catalog", lab / "none", code=1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_bucket_has_the_catalogue_of_a_folder(lab, monkeypatch):
     local = Catalog(str(lab))
     local.scan()
@@ -351,7 +351,7 @@ def test_a_bucket_has_the_catalogue_of_a_folder(lab, monkeypatch):
         assert (catalog.find().status == "analysed").all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_foreign_log_has_the_same_id_on_a_server(tmp_path, monkeypatch):
     messages = [("/a", 10**18 + k, joint_state(k, ["a"], [k * 0.1])) for k in range(30_000)]
     path = write_foreign(tmp_path / "run.mcap", messages)

@@ -141,7 +141,7 @@ def test_a_name_that_is_no_text_is_named(tmp_path):
         Catalog(str(tmp_path)).scan()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_analyses_of_bags_are_made_on_request(bags):
     catalog = Catalog(str(bags))
     catalog.scan()
@@ -150,8 +150,15 @@ def test_analyses_of_bags_are_made_on_request(bags):
     assert rows.path.to_list() == ["day/messages", "day/one.bag"]
 
 
+DIFFERENT = {"one.bag", "sql"}
+"""ROS 1 and ROS 2; the others are MCAP."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in DIFFERENT else pytest.mark.nightly) for n in KINDS],
+)
 def test_the_id_of_a_bag_is_of_its_content(tmp_path, name, opened):
     """Same name, times, topics and sizes of all messages, and the same begin and end."""
 

@@ -70,11 +70,11 @@ DAMAGES = {
 
 
 FAST = {("empty", "analyses")}
-SLOW = {("flipped", "sessions"), ("cut", "joints"), ("folder", "sources")}
+SLOW = {("flipped", "sessions")}
 
 
 def when(damage, kind):
-    """Return the mark of a damage: of each kind some are tried in every integration."""
+    """Return the mark of a damage: two of them are tried in every integration."""
     if (damage, kind) in FAST:
         return ()
     return pytest.mark.slow if (damage, kind) in SLOW else pytest.mark.nightly

@@ -1,5 +1,8 @@
 """Queries of any origin: they read the catalogue alone, and end within memory and time."""
 
+import os
+import re
+import signal
 from pathlib import Path
 
 import pytest
@@ -84,22 +87,23 @@ def test_queries_that_read_are_run(lab):
     assert len(lab.sql("explain select 1")) >= 1
 
 
+LONG_OR_SIMILAR = (
+    ("select * from range(1000000000)", "memory"),
+    ("select repeat('x', 2000000000)", "memory"),
+    ("select range(1000000000)", "memory"),
+    ("select format('{:>2000000000}', 'x')", "memory"),
+    ("select count(*) from range(10000000) a, range(10000000) b", "processor time"),
+    ("with recursive t as (select 1 n union all select n + 1 from t) from t", "processor time"),
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("query", "why"),
     [
-        ("select * from range(1000000000)", "memory"),
-        ("select repeat('x', 2000000000)", "memory"),
-        ("select range(1000000000)", "memory"),
-        ("select format('{:>2000000000}', 'x')", "memory"),
         ("select list(x) from range(1000000000) t(x)", "memory"),
         ("with recursive t as (select 'x' n union all select n || n from t) from t", "memory"),
-        ("select count(*) from range(10000000) a, range(10000000) b", "processor time"),
-        pytest.param(
-            "with recursive t as (select 1 n union all select n + 1 from t) from t",
-            "processor time",
-            marks=pytest.mark.nightly,
-        ),
+        *(pytest.param(*each, marks=pytest.mark.nightly) for each in LONG_OR_SIMILAR),
     ],
 )
 def test_memory_and_time_of_a_query_are_bounded(lab, query, why):
@@ -112,6 +116,31 @@ def test_memory_and_time_of_a_query_are_bounded(lab, query, why):
     assert (again is process) or process.poll() is not None
     lines = Path(f"/proc/{again.pid}/status").read_text().splitlines()
     assert next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) < 1 << 20
+
+
+PROMISED_S = 20
+"""Most processor time that an input of any kind may take: docs/explanation/reliability.md."""
+
+
+def test_the_kernel_limits_the_processor_time_of_a_query_whose_end_is_told(lab):
+    """Whole queries of that length are for the night; here SIGXCPU comes at once."""
+    lab.sql("select 1")
+    process = query_process()._process
+    limits = Path(f"/proc/{process.pid}/limits").read_text()
+    most_s = int(re.search(r"Max cpu time +(\d+) ", limits)[1])
+    used_s = processor_ticks(process.pid) / os.sysconf("SC_CLK_TCK")
+    assert used_s < most_s < used_s + PROMISED_S
+    busy = processor_ticks(process.pid) + 20
+    with (
+        once(
+            lambda: processor_ticks(process.pid) > busy,
+            lambda: process.send_signal(signal.SIGXCPU),
+            "it computes",
+        ),
+        pytest.raises(UsageError, match="processor time"),
+    ):
+        lab.sql("select count(*) from range(10000000) a, range(10000000) b")
+    assert len(lab.find()) == 1
 
 
 def test_errors_come_back_as_what_they_are(lab, tmp_path):

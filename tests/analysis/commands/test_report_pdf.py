@@ -65,7 +65,7 @@ def test_a_session_on_paper(chromium, tmp_path, command):
     assert pages(pdf) > 3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_page_and_paper_together(chromium, tmp_path, report_of):
     html, pdf = tmp_path / "run.html", tmp_path / "run.pdf"
     result = report_of("report", GOLDEN, "-o", html, "--pdf", pdf)
@@ -145,7 +145,7 @@ def test_ctrl_c_ends_the_browser(short, tmp_path):
     wait_for(lambda: processes_of(hanging) == [], "what was killed")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_several_sessions_by_themselves_on_paper(chromium, tmp_path, command):
     pdf = tmp_path / "both.pdf"
     done = command("report", GOLDEN, GOLDEN, "--each", "--pdf", pdf, "--json").out

@@ -89,7 +89,7 @@ def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
     assert all(after <= before + 1 for before, after in pairwise(levels))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, command):
     files = folder / "a.mcap", folder / "sub/a.mcap"
     one, each = tmp_path / "one.html", tmp_path / "each.html"

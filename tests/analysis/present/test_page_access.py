@@ -14,8 +14,11 @@ from undulog.analysis.results.coupling import Coupling
 
 PAGES = [
     *("snake", "hostile"),
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("both_ways", "kicked", "swept")),
-    *(pytest.param(name, marks=pytest.mark.nightly) for name in ("still", "single")),
+    pytest.param("swept", marks=pytest.mark.slow),
+    *(
+        pytest.param(name, marks=pytest.mark.nightly)
+        for name in ("both_ways", "kicked", "still", "single")
+    ),
 ]
 
 
@@ -101,7 +104,7 @@ def test_on_paper_nothing_is_cut(browser, address):
     assert browser.evaluate(BEYOND.replace(".broad, ", "")) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_broad_matrix_has_a_page_across_and_is_not_cut(browser, snake, tmp_path):
     rng = np.random.default_rng(3)
     for count in (25, 60):

@@ -53,7 +53,16 @@ def address(tmp_path_factory, request):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("snake", "hostile"),
+        *(
+            pytest.param(x, marks=pytest.mark.nightly)
+            for x in sorted({*PAGES} - {"snake", "hostile"})
+        ),
+    ],
+)
 def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     url = address(name)
     browser.open(url)

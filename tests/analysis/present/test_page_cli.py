@@ -36,7 +36,7 @@ def test_json_names_page_and_answer_and_the_page_is_the_same(page, recorded, tmp
     assert again.read_bytes() == page.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_several_sessions_are_one_experiment(both_ways_files, tmp_path, command, report_of):
     page = tmp_path / "both.html"
     files = [str(path) for path in both_ways_files]
@@ -94,7 +94,7 @@ def test_a_real_ramp_gets_its_page_without_invented_numbers(tmp_path, command):
     assert "No gait: the best rhythm" in text
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_paper_s_claim_from_the_twin_to_the_browser(browser, tmp_path, command):
     session, page = tmp_path / "weak.mcap", tmp_path / "weak.html"
     command("sim", "run", "weak-servo-pi3", "-o", session)

@@ -107,7 +107,9 @@ def entries(count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "small"), [(4, False), (30, False), (5, True)])
+@pytest.mark.parametrize(
+    ("count", "small"), [(4, False), pytest.param(30, False, marks=pytest.mark.nightly), (5, True)]
+)
 def test_a_matrix_has_the_colours_of_its_cells(count, small, tmp_path):
     shown = entries(count)
     svg = matrix_picture(shown, "coupling-figure", small=small).svg

@@ -143,14 +143,19 @@ def test_a_coupling_is_one_row_a_pair(kicked):
 @pytest.mark.parametrize(
     ("name", "pictures"),
     [
-        ("snake", ["segments", "body"]),
         ("hostile", ["segments"]),
-        ("single", ["segments"]),
-        ("both ways", ["mirror"]),
-        ("kicked", ["P", "R", "G", "S"]),
-        ("reversal", ["mirror"]),
-        ("local coupling", ["P"]),
         ("comparison", ["differences", "waveforms"]),
+        *(
+            pytest.param(*each, marks=pytest.mark.nightly)
+            for each in (
+                ("snake", ["segments", "body"]),
+                ("single", ["segments"]),
+                ("both ways", ["mirror"]),
+                ("kicked", ["P", "R", "G", "S"]),
+                ("reversal", ["mirror"]),
+                ("local coupling", ["P"]),
+            )
+        ),
     ],
 )
 def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path):

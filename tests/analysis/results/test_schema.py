@@ -63,7 +63,10 @@ def test_a_result_that_lacks_a_key_or_has_another_type_is_none(report_of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", ["both_ways", "kicked", "swept"])
+@pytest.mark.parametrize(
+    "experiment",
+    ["swept", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("both_ways", "kicked"))],
+)
 def test_an_experiment_of_each_kind(experiment, tmp_path, report_of):
     result = report_of("analyse", *getattr(linear_chain, experiment)(tmp_path))
     assert faults("experiment", result) == []
@@ -85,7 +88,16 @@ def test_a_prediction(tmp_path, report_of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", ["so101/coupled_joints", "so101/multisine", "go2/traj_0.pt"])
+@pytest.mark.parametrize(
+    "data",
+    [
+        "so101/multisine",
+        *(
+            pytest.param(x, marks=pytest.mark.nightly)
+            for x in ("so101/coupled_joints", "go2/traj_0.pt")
+        ),
+    ],
+)
 def test_a_real_recording(data, tmp_path, command, report_of):
     if not SHARED.is_dir():
         pytest.skip(f"the real recordings {SHARED.name} are not beside this checkout")

@@ -110,7 +110,7 @@ def test_the_reversal_takes_all_groups_together(tmp_path):
     assert min(result.reversal.joints, key=lambda one: one.p).name in ("joint03", "joint07")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_reversal_of_one_group_only_is_none(tmp_path):
     result = experiment(runs(tmp_path, weak=1.0, apart=True))
     assert result.reversal is None

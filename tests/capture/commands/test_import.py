@@ -105,7 +105,9 @@ def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)]
+)
 def test_a_signal_leaves_a_whole_file(number, tmp_path):
     trace, run = tmp_path / "trace.log", tmp_path / "run.mcap"
     lines = (

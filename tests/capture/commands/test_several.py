@@ -87,14 +87,17 @@ def test_bags_in_folders_and_patterns_are_one_session_each(bags):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", [("log", "info"), ("log", "check"), ("analyse",)])
+@pytest.mark.parametrize(
+    "line",
+    [("log", "info"), ("log", "check"), pytest.param(("analyse",), marks=pytest.mark.nightly)],
+)
 def test_commands_read_the_bags_of_a_folder(line, bags, report_of, command):
     rows = report_of(*line, bags / "day")
     assert len(rows) == 5
     assert not [row for row in rows if "error" in row]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_report_has_the_bags_of_a_folder(bags, tmp_path, report_of):
     report = report_of("report", bags / "day", "-o", tmp_path / "page.html")
     assert [len(one["sentence"]) > 0 for one in report["answers"]] == [True] * 5

@@ -43,7 +43,7 @@ def test_files_cut_empty_or_of_another_kind_have_a_reason(trial):
         assert trial.fault(data)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_value_that_expands_beyond_any_row_is_a_fault(trial):
     column = pa.array([b"\0" * (700 << 20)])
     packed = parquet_of(pa.table({"x": column}), compression="zstd", use_dictionary=False)

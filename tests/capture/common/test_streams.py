@@ -76,7 +76,7 @@ for verb in VERBS:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_command_takes_closed_streams_and_an_encoding_of_ascii():
     assert len(VERBS) > 30
     done = python(EVERY, cwd=ROOT)

@@ -43,6 +43,7 @@ def bounded(path, *words):
 # -- MATLAB --------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_every_type_that_an_element_of_a_mat_file_may_state(tmp_path):
     """With the type of its numbers 0, 2 or others, scipy is ended by SIGSEGV."""
     whole = io.BytesIO()
@@ -70,6 +71,7 @@ def test_a_mat_file_that_declares_more_than_it_is_worth(tmp_path):
     refused(path, *imported(path))
 
 
+@pytest.mark.nightly
 def test_a_compressed_element_that_expands(tmp_path):
     packed = zlib.compressobj(9)
     body = packed.compress(struct.pack("<II", 14, 3 << 30))
@@ -96,19 +98,24 @@ def nested(depth):
     return b"K\x01q\x00" + b"".join(steps)
 
 
+ENDS = (
+    b"}h%cK\x01s.",
+    b"ctorch._utils\n_rebuild_tensor_v2\n(h%ch%cK\x00h%ctR.",
+)
+"""Walked by what looks up a dictionary, and by what makes a tensor."""
+LIKE_THEM = (
+    b"(X\x07\x00\x00\x00storageq\xf0ctorch\nFloatStorage\nh%cX\x03\x00\x00\x00cpuK\x01tQ.",
+    b"(h%cctorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x01tQ.",
+    b"h%ch\x00\x93.",
+    b"h\x00h%c\x93.",
+    b"h\x00h%cR.",
+    b"}X\x01\x00\x00\x00ah%cs.",
+    b"ctorch._utils\n_rebuild_parameter\n(h%ctR.",
+)
+
+
 @pytest.mark.parametrize(
-    "end",
-    [
-        b"}h%cK\x01s.",
-        b"(X\x07\x00\x00\x00storageq\xf0ctorch\nFloatStorage\nh%cX\x03\x00\x00\x00cpuK\x01tQ.",
-        b"(h%cctorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x01tQ.",
-        b"h%ch\x00\x93.",
-        b"h\x00h%c\x93.",
-        b"h\x00h%cR.",
-        b"}X\x01\x00\x00\x00ah%cs.",
-        b"ctorch._utils\n_rebuild_tensor_v2\n(h%ch%cK\x00h%ctR.",
-        b"ctorch._utils\n_rebuild_parameter\n(h%ctR.",
-    ],
+    "end", [*ENDS, *(pytest.param(end, marks=pytest.mark.nightly) for end in LIKE_THEM)]
 )
 def test_a_tensor_file_of_nested_tuples(end, tmp_path):
     depth = 60
@@ -139,7 +146,7 @@ def repeated_text(path, *, plain):
     return path
 
 
-@pytest.mark.parametrize("plain", [True, False])
+@pytest.mark.parametrize("plain", [pytest.param(True, marks=pytest.mark.nightly), False])
 def test_a_column_of_long_texts_is_left_out(plain, tmp_path):
     path = repeated_text(tmp_path / "note.parquet", plain=plain)
     assert path.stat().st_size < 300_000
@@ -210,7 +217,13 @@ def some_messages():
 
 @pytest.mark.parametrize(
     "data",
-    ["zeroblob(1000000)", "hex(zeroblob(100000000))", "printf('%.*c', 900000000, 'x')"],
+    [
+        "hex(zeroblob(100000000))",
+        *(
+            pytest.param(data, marks=pytest.mark.nightly)
+            for data in ("zeroblob(1000000)", "printf('%.*c', 900000000, 'x')")
+        ),
+    ],
 )
 def test_frames_that_are_computed(data, tmp_path):
     path = log_messages(tmp_path / "trace.db", some_messages())
@@ -248,7 +261,16 @@ def test_damaged_logs_of_frames(kind, tmp_path):
 # -- no files ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "mat", "npz", "pt", "blf", "db", "log"])
+@pytest.mark.parametrize(
+    "suffix",
+    [
+        *("csv", "mat"),
+        *(
+            pytest.param(s, marks=pytest.mark.nightly)
+            for s in ("parquet", "npz", "pt", "blf", "db", "log")
+        ),
+    ],
+)
 def test_a_pipe_is_not_waited_for(suffix, tmp_path):
     path = tmp_path / f"x.{suffix}"
     os.mkfifo(path)

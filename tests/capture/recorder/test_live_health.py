@@ -309,7 +309,7 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(seconds, dat
     assert found[1].tolist() == [EPOCH_NS // NS + since if lasted else 0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
     """What is kept is counted after 10 and after 60 minutes of a slow recording."""
 

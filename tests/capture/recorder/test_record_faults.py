@@ -39,7 +39,9 @@ ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
+@pytest.mark.parametrize(
+    "first", [0, pytest.param(199, marks=pytest.mark.nightly)], ids=["the first", "later"]
+)
 def test_an_impossible_device_time_ends_no_decoding(first, tmp_path):
     bus, frames = tmp_path / "bus.sock", polling()
     odd = frames[first::200]
@@ -64,7 +66,9 @@ TIMES = ("9300000000.0", "99999999999.0", "-1.5", "nan", "inf", "1e300", "9" * 3
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
+@pytest.mark.parametrize(
+    "first", [pytest.param(0, marks=pytest.mark.nightly), 199], ids=["the first", "later"]
+)
 def test_an_impossible_time_of_socketcand_ends_no_decoding(first, tmp_path):
     frames = polling()[1::2]  # a server marks no directions: answers only
     odd = range(first, len(frames), 200)

@@ -8,6 +8,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
+from itertools import product
 
 import numpy as np
 import pytest
@@ -25,9 +26,16 @@ class Chosen:
         return (low + high) / 2
 
 
+IN_INTEGRATION = {("unix", "running"), ("serial", "ending")}
+"""The rest of the sources and moments is for the night."""
+
+
+def marked(case):
+    return pytest.param(*case, marks=() if case in IN_INTEGRATION else pytest.mark.nightly)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("when", ["running", "ending"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "when"), [*map(marked, product(KINDS, ("running", "ending")))])
 def test_a_stopped_recorder_loses_no_accepted_frame(kind, when, tmp_path):
     result = run_case(tmp_path, kind, 0.05, when, Chosen())
     assert not result.failures

@@ -81,7 +81,14 @@ def delete_above(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("harm", [delete, recreate, delete_file, delete_above])
+@pytest.mark.parametrize(
+    "harm",
+    [
+        delete,
+        delete_file,
+        *(pytest.param(h, marks=pytest.mark.nightly) for h in (recreate, delete_above)),
+    ],
+)
 def test_what_was_deleted_is_rescued(harm, case, command, tmp_path):
     code, report, errors = case.run(harm)
     (rescue,) = report["rescued"]

@@ -187,7 +187,10 @@ def test_the_log_of_the_folders_own_user_may_be_replaced_by_root(shared):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("force", [(), ("--force",)] * 2)
+@pytest.mark.parametrize(
+    "force",
+    [(), ("--force",), *(pytest.param(f, marks=pytest.mark.nightly) for f in ((), ("--force",)))],
+)
 def test_of_recorders_that_are_given_one_output_at_once_one_records(force, tmp_path):
     output, names = tmp_path / "run.mcap", ("a", "b", "c")
     controls = [tmp_path / f"{name}.control" for name in names]

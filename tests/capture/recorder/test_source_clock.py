@@ -121,7 +121,7 @@ def test_the_intervals_are_the_device_s_and_no_stamp_is_repeated():
     assert np.diff(made.host).std() > 20 * (steps - np.diff(made.true))[settled].std()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_hour_of_a_quartz_in_the_sun_is_followed():
     """The rate wanders by 20 ppm within the hour; memory holds one minute of it."""
     rng = np.random.default_rng(5)
@@ -240,7 +240,7 @@ def test_a_stalled_host_does_not_move_the_line():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step_ms", [-20, 20])
+@pytest.mark.parametrize("step_ms", [pytest.param(-20, marks=pytest.mark.nightly), 20])
 def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms):
     made = make(duration_s=90.0, polled=False)
     host = made.host + np.where(made.after_s > 45, step_ms * 1_000_000, 0) + 30_000_000
@@ -251,7 +251,9 @@ def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("silence_s", [30, 900, 40_000])
+@pytest.mark.parametrize(
+    "silence_s", [40_000, *(pytest.param(s, marks=pytest.mark.nightly) for s in (30, 900))]
+)
 def test_a_long_silence_is_no_reset_and_the_offset_is_found_at_once(silence_s):
     """The rate moves by 1 ppm meanwhile, as a quartz's does from one room to the next."""
     made = make(duration_s=80.0, polled=False)

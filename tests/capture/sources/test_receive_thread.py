@@ -116,7 +116,9 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
+)
 def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
     path, output = tmp_path / "bus.sock", tmp_path / "run.mcap"
     with recording(output, f"bus=unix:{path}") as recorder, Sender(path) as sender:

@@ -120,7 +120,7 @@ def test_without_a_logged_phase_there_are_no_cycles(write, tmp_path):
     assert measured_in_batches(write(tmp_path / "a.mcap", gait=False), 50_000_000) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_path, read_back):
     report, output = seen_live(walk, tmp_path)
     assert report["dropped"] == report["unread"] == 0

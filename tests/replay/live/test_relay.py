@@ -90,7 +90,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     stage, snake25, truth, tmp_path, read_back
 ):

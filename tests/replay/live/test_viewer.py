@@ -54,7 +54,7 @@ def test_relay_of_a_frozen_viewer_can_be_ended(stage, server):
     assert re.search("the viewer (did not take the last of it|takes no data)", err)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_web_serves_this_machine_only_and_leaves_nothing(stage):
     relay = stage.relay(None, "--web")
     page = relay.process.stdout.readline().strip()

@@ -17,7 +17,7 @@ def bucket(monkeypatch):
         yield client
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
     plan, url = write_plan(tmp_path, (0.1, 0.2), top="sessions = true"), "s3://robots/strength"
     assert undulog("sweep", plan, "-o", tmp_path / "rows").returncode == 0

@@ -56,7 +56,7 @@ def test_a_process_that_stands_still_during_a_run_is_ended(sweep, monkeypatch):
     assert (alive(pid), os.path.exists(folder)) == (False, False)  # noqa: PTH110
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_without_workers_is_given_up(tmp_path):
     port = free_port()
     with scheduler(port), swept(tmp_path, port, 8.0) as sweep:

@@ -63,7 +63,7 @@ def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path, command
         assert analyse_session(session).answer.sentence == row.sentence
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
     plan = write_plan(tmp_path, (0.1, 0.2), seeds=2)
     first, _ = swept(plan, tmp_path / "rows")
@@ -188,7 +188,7 @@ def test_a_sweep_that_was_interrupted_twice_goes_on_where_it_stopped(signals, re
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("temporary")
 def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")

@@ -117,7 +117,7 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, co
     assert np.abs(found - cycles[: found.shape[1]].T).max() <= STEP / 2 * (1 + 1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_adaptive_controller_does_the_same_over_the_bus_as_in_process(tmp_path):
     scenario = load_scenario("target-following").changed(duration_s=3.0)
     over_bus = []

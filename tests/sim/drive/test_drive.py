@@ -84,10 +84,17 @@ def everything(path):
 
 
 # Among its logged values, target following has some that are not known yet.
+MARKS = {
+    "target-following": (),
+    **dict.fromkeys(("corridor", "oscillators-feedback", "twist"), pytest.mark.slow),
+}
+"""The others, each a motion like one of these, are for the night."""
+
+
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name == "target-following" else pytest.mark.slow)
+        pytest.param(name, marks=MARKS.get(name, pytest.mark.nightly))
         for name in sim.scenario_names()
     ],
 )
@@ -188,7 +195,9 @@ def test_a_gait_can_be_driven_in_another_world(tmp_path, command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.nightly), signal.SIGINT]
+)
 def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     path = tmp_path / "stopped.mcap"
     process = start(*UNDULOG, "drive", "flat", "--on", "twin", "-o", path, "--duration", "3600")

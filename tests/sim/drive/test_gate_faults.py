@@ -63,7 +63,7 @@ def test_lost_replies_end_it_and_name_the_joint(driving):
     gate_stage.check_ramp_down(written, "fault: ")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     holds = SAFETY | {"on_fault": '"hold"'}
     robot, scenario = gate_stage.robot_files(tmp_path / "holds", safety=holds)
@@ -79,7 +79,7 @@ def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     gate_stage.check_hold(written, "fault: ")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_after_bus_off_nothing_more_is_sent(driving):
     with driving(f"bus-off@{FAULT_AT_S}+2") as drive:
         _, err, written = drive.ended()
@@ -89,7 +89,7 @@ def test_after_bus_off_nothing_more_is_sent(driving):
     assert all(len(angle) == 0 for angle in written.after("fault: ").values())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(driving):
     with driving(f"over-current:joint02:1.5@{FAULT_AT_S}") as drive:
         _, err, written = drive.ended()
@@ -100,7 +100,7 @@ def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(driving):
     gate_stage.check_ramp_down(written, "fault: ", yields=["joint02"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_process_that_comes_late_does_not_jump(driving):
     with driving() as drive:
         drive.begun()
@@ -157,7 +157,7 @@ def refused(folder, scenario, sessions):
     return noted
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     bare, _ = gate_stage.robot_files(tmp_path / "bare", safety=None)
     session = gate_stage.commanded(tmp_path / "limits.mcap", bare, 1.0)
@@ -186,7 +186,7 @@ def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(sma
     assert " is snake4, and robot.mcap is for snake25; nothing was sent" in noted["robot"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(driving, tmp_path):
     folder = tmp_path / "moved"
     _, scenario = gate_stage.robot_files(folder)
@@ -222,7 +222,7 @@ def test_ctrl_c_brings_the_joints_down(driving):
     gate_stage.check_ramp_down(written, "gate: ending, stop requested (Ctrl-C)")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_second_ctrl_c_ends_it_at_once(driving):
     with driving() as drive:
         drive.begun()
@@ -266,7 +266,7 @@ def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_pa
     assert not errors(written)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_robot_that_is_gone_leaves_a_whole_session(driving):
     with driving() as drive:
         drive.begun()
@@ -294,7 +294,7 @@ def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
     assert not errors(written)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_robot_that_comes_late_is_not_the_controllers_fault(driving):
     """By the listener these tests know whether a bus was silent by itself."""
     with driving() as drive:

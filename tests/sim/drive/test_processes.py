@@ -138,6 +138,7 @@ def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
         assert driven(*words, "--recorder", sockets[1], env=alone)["recorder"] == sockets[1]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "number",
     [

@@ -246,7 +246,7 @@ print(status("VmHWM") - before - sum(arrays.values()) - path.stat().st_size)
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.nightly), 4])
 def test_beyond_the_arrays_and_the_file_a_reader_needs_little(tmp_path, threads):
     path = tmp_path / "s.mcap"
     write_session(path, 150_000)  # some 200 MB of arrays

@@ -74,7 +74,7 @@ def test_a_damaged_bag_is_named_with_the_fix(damage, tmp_path):
 
 @MODES
 @pytest.mark.parametrize("storage", StoragePlugin)
-@pytest.mark.parametrize("cases", [3, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cases", [3, pytest.param(10, marks=pytest.mark.nightly)])
 def test_a_mutated_bag_reads_or_is_refused_in_words(storage, compression, cases, tmp_path):
     bag = write_bag(tmp_path / "bag", filled, storage=storage, compression=compression)
     draw = np.random.default_rng(11)

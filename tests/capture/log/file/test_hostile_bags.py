@@ -48,7 +48,10 @@ COMPUTED = {
         *(pytest.param(v, marks=pytest.mark.nightly) for v in (("log", "check"), ("analyse",))),
     ],
 )
-@pytest.mark.parametrize("name", COMPUTED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.nightly if n == "printed" else ()) for n in COMPUTED],
+)
 def test_messages_that_are_computed(verb, name, tmp_path):
     rows = 3000 if name == "zeros" else 2  # SQLite computes the others already as it writes them
     path = database(tmp_path / f"{name}.db3", f"{MESSAGES}, {COMPUTED[name]}", rows=rows)

@@ -228,7 +228,7 @@ def test_a_damaged_chunk_is_left_out_and_named(chunked, tmp_path, opened):
         assert any("its messages are missing" in warning for warning in far.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mutated_summaries_never_read_otherwise_than_here(chunked, tmp_path):
     """Each byte of the summary may be wrong: the outcome is the file's own, or says what lacks.
 
@@ -279,7 +279,7 @@ def bucket():
         yield client
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_hour_in_a_bucket_is_analysed_in_a_window_with_few_of_its_bytes(
     bucket, tmp_path, monkeypatch, command
 ):

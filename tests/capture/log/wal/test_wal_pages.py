@@ -54,7 +54,7 @@ def test_a_page_that_is_written_no_more_is_synced_in_the_end(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [0, 2 * PAGE])
+@pytest.mark.parametrize("size", [pytest.param(0, marks=pytest.mark.nightly), 2 * PAGE])
 def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
     output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"
     frame, accepted = empty_frames(1), 1
