@@ -79,16 +79,17 @@ def test_every_release_of_the_controller_state(version, storage, tmp_path, repor
     check(report_of("analyse", path))
 
 
-def test_the_joints_of_an_array_are_named_by_the_option(tmp_path, report_of, command):
+def test_the_joints_of_an_array_are_those_of_the_states_or_of_the_option(
+    tmp_path, report_of, command
+):
     bag = write_bag(tmp_path / "bag", filling(array))
     result = report_of("analyse", bag)
-    (warning,) = [text for text in result["warnings"] if "no command logged" in text]
-    assert "/forward/commands:JOINT,..." in warning
-    assert "--command-topic" in warning
+    check(result)
+    (note,) = [note for note in result["notes"] if "names no joints" in note]
+    assert "--command-topic /forward/commands:JOINT,JOINT,..." in note
     named = f"/forward/commands:{','.join(NAMES)}"
     check(report_of("analyse", bag, "--command-topic", named))
-    err = command("analyse", bag, "--command-topic", "/forward/commands", code=1).err
-    assert "--command-topic /forward/commands:JOINT,JOINT" in err
+    check(report_of("analyse", bag, "--command-topic", "/forward/commands"))
     err = command("analyse", bag, "--command-topic", "/forward/commands:a,b", code=1).err
     assert "3 values in a message, but 2 joints are named" in err
     err = command("analyse", bag, "--command-topic", "/forward/commands:a,a,b", code=1).err
