@@ -66,7 +66,7 @@ def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():
     assert not len(poll_frames(load_robot("snake25")))  # it tells unasked
 
 
-@pytest.mark.slow
+@pytest.mark.clock(0.02, "a servo in a thread has to answer within a control tick")
 def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     angles = 0.5 + 0.2 * np.sin(np.arange(121).clip(max=40) / 10)  # then it catches up
     one = Servo(math.degrees(0.3))
@@ -88,7 +88,7 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
         assert np.nanmax(np.abs(session.joints("/joint_states").values[0] - 0.3)) < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.clock(0.02, "a servo in a thread has to answer within a control tick")
 def test_its_temperature_ends_the_drive(tmp_path, robot):
     one = Servo(math.degrees(0.5))
     one.temperature = 61
