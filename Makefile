@@ -48,23 +48,27 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
 # Four processes at once: two of tests that compute, in the time that the others leave them, which
-# have the tests of processes, time and pictures, and wait more than they compute.
-ANALYSIS = tests/analysis tests/docs
+# have the tests of processes, time and pictures, and wait more than they compute. A file of one may
+# lie in a folder of another: all four shall end at about the same time.
+ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py test_standing.py) \
+  tests/analysis tests/docs
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
   $(addprefix tests/capture/,bus following robot) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
-WAITING = tests/replay tests/sim
+WAITING = $(addprefix tests/house/,test_package.py test_root_names.py) tests/replay tests/sim
+# Some paths without what lies in them and is listed for another process.
+part = $(addprefix --ignore=,$(filter $(addsuffix /%,$(1)),$(ANALYSIS) $(COMPUTING) $(WAITING))) $(1)
 # JUnit files, with the seconds of each test, lie in out/tests/.
 define tests
 	@mkdir -p out/tests; logs=$$(mktemp -d); \
 	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-analysis.xml \
-	  $(ANALYSIS) >$$logs/1 2>&1 & first=$$!; \
+	  $(call part,$(ANALYSIS)) >$$logs/1 2>&1 & first=$$!; \
 	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-computing.xml \
-	  $(COMPUTING) >$$logs/2 2>&1 & second=$$!; \
+	  $(call part,$(COMPUTING)) >$$logs/2 2>&1 & second=$$!; \
 	$(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-waiting.xml \
-	  $(addprefix --ignore=,$(COMPUTING)) $(WAITING) >$$logs/3 2>&1 & third=$$!; \
+	  $(call part,$(WAITING)) >$$logs/3 2>&1 & third=$$!; \
 	trap "kill $$first $$second $$third; rm -rf $$logs; exit 130" INT TERM; \
 	$(PYTEST) -m $(2) --junitxml out/tests/$(1).xml \
 	  $(addprefix --ignore=,$(ANALYSIS) $(COMPUTING) $(WAITING)); last=$$?; \

@@ -20,8 +20,8 @@ COMMANDS = [
 RUN = "undulog sim run weak-servo-pi3 -o run.mcap"
 CLIP = "undulog view run.mcap --clip run.mp4"
 SHORTER = {RUN: f"{RUN} --duration 12.5", f"{CLIP} --to 4": f"{CLIP} --to 0.2"}
-"""What is run in place of two commands [s]: a session as long as `log cut --stop 12` needs, of the
-20 s that test_demo.py has, and fewer pictures."""
+"""What is run in place of two commands [s]: a session that is only as long as `log cut --stop 12`
+needs, as test_demo.py has a whole one, and fewer pictures."""
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 # An ArcSnake-like exchange: request and reply share an identifier, direction tells them apart.
 TRACE = "".join(

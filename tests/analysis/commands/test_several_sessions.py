@@ -65,7 +65,7 @@ def test_report_into_a_folder_writes_a_page_each_and_an_index(folder, tmp_path, 
     assert (pages / "a.html").read_text() == alone.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
     page = tmp_path / "all.html"
     printed = command("report", folder, "-o", page, code=1).out.splitlines()

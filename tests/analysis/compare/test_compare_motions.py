@@ -206,7 +206,7 @@ def test_a_dead_joint_is_named_first(write):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_groups_and_pairs_by_the_command_line(write, tmp_path, command, report_of):
     change = np.array([1, 1.05, 1, 1, 1, 1])
     a = [write(f"a{k}", 20 + k) for k in range(3)]

@@ -71,7 +71,7 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
     recorder, first = stage.recorder(), stage.relay("first.rrd")

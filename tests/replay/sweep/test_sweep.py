@@ -105,7 +105,7 @@ def test_a_failed_run_keeps_its_error_and_can_be_run_again(tmp_path):
     assert pd.read_parquet(tmp_path / "rows" / "rows").key.is_unique
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_parameters_of_robot_and_analysis(tmp_path):
     plan = write_plan(tmp_path, (0.3,))
     plan.write_text(
