@@ -57,7 +57,8 @@ COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py te
   $(addprefix tests/capture/,bus following robot) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
-WAITING = $(addprefix tests/house/,test_package.py test_root_names.py) tests/replay tests/sim
+WAITING = $(addprefix tests/analysis/,estimators experiment response) \
+  $(addprefix tests/house/,test_package.py test_root_names.py) tests/replay tests/sim
 # Some paths without what lies in them and is listed for another process.
 part = $(addprefix --ignore=,$(filter $(addsuffix /%,$(1)),$(ANALYSIS) $(COMPUTING) $(WAITING))) $(1)
 # JUnit files, with the seconds of each test, lie in out/tests/.
