@@ -68,6 +68,7 @@ def driven(*words, env):
     return report
 
 
+@pytest.mark.clock(0.02, "a robot in another process has to answer within three control ticks")
 def test_a_recorder_gets_the_gait_through_its_control_socket(tmp_path, alone):
     path = tmp_path / "recorded.mcap"
     with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
