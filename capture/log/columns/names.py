@@ -2,8 +2,8 @@
 
 Nothing in a JointState or a trajectory forbids two joints with one name, and descriptions that were
 copied have them. Whoever looks a joint up by its name would get one of the two. So the second one
-is read as ``NAME (2)``, the third as ``NAME (3)``: each keeps its values, and whoever reads the log
-is told.
+is read as ``NAME (2)``, the third as ``NAME (3)``: each keeps its values, and a
+reader of the log gets a warning.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def paused(t_ns: IntArray, positions: FloatArray) -> IntArray:
     runs = runs[long]
     if not runs.size:
         return _NONE
-    usual = np.array([np.percentile(each[each > 0], USUAL_PERCENTILE) for each in step])
+    usual = np.array([np.percentile(size[size > 0], USUAL_PERCENTILE) for size in step])
     jumps = np.median(step[:, runs[:, 1] - 1] / usual[:, None], axis=0)
     return runs[jumps > JUMP]
 
@@ -75,19 +75,19 @@ def without_pauses(
     """Leave out what is repeated in pauses of the bus.
 
     Args:
-        commands: By joint; without them no pause is told.
+        commands: By joint; without them no pause is found.
         positions: By joint; they have pauses only if all have the same times.
         others: Further quantities, of which those with these times lose the same samples.
 
     Returns:
         First and last time of each pause [Unix ns], shape (p, 2), and the signals, positions first.
     """
-    every = [dict(positions), *(dict(one) for one in others)]
+    every = [dict(positions), *map(dict, others)]
     signals = list(positions.values())
-    if len(signals) < 2 or any(one.t_ns is not signals[0].t_ns for one in signals):
+    if len(signals) < 2 or any(signal.t_ns is not signals[0].t_ns for signal in signals):
         return _NONE, every
     t_ns = signals[0].t_ns
-    runs = paused(t_ns, np.stack([one.values for one in signals]))
+    runs = paused(t_ns, np.stack([signal.values for signal in signals]))
     asked = [commands[name] for name in positions if name in commands]
     spans = zip(t_ns[runs[:, 0] - 1].tolist(), t_ns[runs[:, 1] - 1].tolist(), strict=True)
     runs = runs[np.array([_moved(asked, *span) for span in spans], dtype=np.bool_)]
@@ -99,10 +99,12 @@ def without_pauses(
     left_ns = t_ns[kept]
     thinned = [
         {
-            name: Signal(one.name, one.unit, left_ns, one.values[kept]) if one.t_ns is t_ns else one
-            for name, one in each.items()
+            name: Signal(signal.name, signal.unit, left_ns, signal.values[kept])
+            if signal.t_ns is t_ns
+            else signal
+            for name, signal in by_joint.items()
         }
-        for each in every
+        for by_joint in every
     ]
     return np.stack([t_ns[runs[:, 0] - 1], t_ns[runs[:, 1]]], axis=1), thinned
 
@@ -112,9 +114,9 @@ def _moved(commands: Sequence[Signal], start_ns: int, stop_ns: int) -> bool:
     middle_ns = (start_ns + stop_ns) // 2
     for limits in (start_ns, middle_ns), (middle_ns, stop_ns):
         moved = 0
-        for one in commands:
-            first, last = np.searchsorted(one.t_ns, limits).tolist()
-            part = one.values[max(first - 1, 0) : last + 1]
+        for signal in commands:
+            first, last = np.searchsorted(signal.t_ns, limits).tolist()
+            part = signal.values[max(first - 1, 0) : last + 1]
             moved += part.size > 0 and float(np.ptp(part)) > COMMAND_RAD
         if not commands or 2 * moved < len(commands):
             return False
