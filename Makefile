@@ -5,6 +5,9 @@ PYTHON ?= $(firstword $(shell command -v python3.11 python3 python 2>/dev/null))
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+# The lock is installed by uv, which takes seconds where pip takes minutes, or by pip if uv doesn't
+# reach the registry, e.g. as only pip is told of one.
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 DEMO   := out/demo
 
 # The matrices are small: more threads of linear algebra only get in each other's way.
@@ -23,8 +26,11 @@ $(READY): requirements.lock pyproject.toml
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "undulog is set up on Python 3.11 (pybullet has wheels for it); found %d.%d. Use: make PYTHON=python3.11" % sys.version_info[:2])'
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
 	@echo "Installing the locked packages into $(VENV) (about a minute) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@awk '/^[a-z]/ {wanted = /^uv==/} wanted' requirements.lock >$(VENV)/uv.txt
+	@$(PIP) --require-hashes -r $(VENV)/uv.txt
+	@VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet --compile-bytecode --require-hashes -r requirements.lock \
+	  || $(PIP) --require-hashes -r requirements.lock
+	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
 define undulog

@@ -355,6 +355,9 @@ def main() -> None:
             _complain(f"the output can't be written: {error.strerror}", code)
         except OSError:  # the error output may be on the same disk
             _discard_output()
+    waits = sys.modules.get("undulog.capture.common.waits")
+    if waits is not None and waits.calls_go_on():
+        os._exit(code)  # standard output was flushed, and standard error has no buffer to flush
     sys.exit(code)
 
 

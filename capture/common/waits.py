@@ -30,6 +30,18 @@ _MOST_S = 1.0  # that one look counts [s]; more, and this process was stopped it
 
 _Result = TypeVar("_Result")
 
+_given_up: list[threading.Thread] = []
+
+
+def calls_go_on() -> bool:
+    """Return whether a call that :func:`attended` has given up goes on.
+
+    A process with such calls has to end by ``os._exit``: one that asks for Python's lock while the
+    interpreter is taken down has its thread unwound through the library's frames, which aborts the
+    process (Python before 3.14).
+    """
+    return any(thread.is_alive() for thread in _given_up)
+
 
 class Standstill:
     """Time without progress, as looks at it find it."""
@@ -71,7 +83,8 @@ def attended(
 ) -> _Result:
     """Make a call that may never return, and wait for it while there is progress.
 
-    The call is made in a thread of its own, which stays behind where this gives up.
+    The call is made in a thread of its own, which stays behind where this gives up: see
+    :func:`calls_go_on`.
 
     Args:
         what: What is waited for, the subject of the message.
@@ -98,13 +111,17 @@ def attended(
     thread = threading.Thread(target=run, name=f"undulog: {what}", daemon=True)
     still = Standstill(limit_s)
     thread.start()
-    while True:
-        thread.join(_LOOK_S)
-        if not thread.is_alive():
-            break
-        look()
-        if still.reached(progress()):
-            raise NoAnswerError(what, limit_s, advice)
+    try:
+        while True:
+            thread.join(_LOOK_S)
+            if not thread.is_alive():
+                break
+            look()
+            if still.reached(progress()):
+                raise NoAnswerError(what, limit_s, advice)
+    finally:
+        if thread.is_alive():
+            _given_up.append(thread)
     if failures:
         raise failures[0]
     return results[0]

@@ -9,7 +9,32 @@ from support.processes import freeze, python_started, wait_for
 from support.simulated_clock import SimulatedClock
 from undulog.capture.common import waits
 from undulog.capture.common.errors import NoAnswerError, UndulogError
-from undulog.capture.common.waits import Standstill, attended, end_process, processor_time
+from undulog.capture.common.waits import (
+    Standstill,
+    attended,
+    calls_go_on,
+    end_process,
+    processor_time,
+)
+
+COMMAND = """
+import atexit, sys, threading, time
+import undulog
+from undulog.capture.common.errors import NoAnswerError
+from undulog.capture.common.waits import attended
+
+def run(_):
+    atexit.register(print, "taken down", flush=True)
+    print("done")
+    try:
+        attended(lambda: time.sleep(float(sys.argv[1])), "it", "wait", limit_s=0.1)
+    except NoAnswerError:
+        return 1
+    return 0
+
+undulog.run = run
+undulog.main()
+"""
 
 TRACER = """
 import ctypes, os, sys, time
@@ -62,6 +87,24 @@ def test_a_look_can_end_a_wait(silent):
 
     with pytest.raises(KeyError, match="no longer"):
         attended(silent, "it", "wait", look=look)
+
+
+def test_a_call_that_was_given_up_goes_on_until_it_returns():
+    reads, writes = os.pipe()
+    with pytest.raises(NoAnswerError):
+        attended(lambda: os.read(reads, 1), "it", "wait", limit_s=0.1)
+    assert calls_go_on()
+    os.close(writes)
+    wait_for(lambda: not calls_go_on(), "the end of the call")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "code", "printed"), [("600", 1, "done\n"), ("0", 0, "done\ntaken down\n")]
+)
+def test_with_a_call_that_goes_on_the_process_ends_without_being_taken_down(seconds, code, printed):
+    with python_started(COMMAND, seconds) as process:
+        assert process.communicate()[0] == printed
+    assert process.returncode == code
 
 
 def test_time_in_which_the_process_itself_was_stopped_does_not_count():
