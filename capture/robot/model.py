@@ -89,6 +89,13 @@ class Safety:
         return frozen(np.array([own.get(name, fallback) for name in joint_names]))
 
 
+class Seat(StrEnum):
+    """Where a servo's velocity and effort are measured."""
+
+    LOOP = "loop"
+    JOINT = "joint"
+
+
 class Plane(StrEnum):
     """The plane in which a joint bends the body."""
 
@@ -166,6 +173,8 @@ class Joint:
         lower: Lower limit [rad].
         upper: Upper limit [rad].
         max_velocity: Rate limit [rad/s].
+        sits: Where velocity and effort are measured: inside of the servo's own ``loop``, which
+            takes them from the encoder that it controls, or outside of it, at the ``joint``.
     """
 
     name: Name
@@ -173,6 +182,7 @@ class Joint:
     lower: float = -math.pi / 6
     upper: float = math.pi / 6
     max_velocity: Positive = 10.0
+    sits: Seat = Seat.LOOP
     servo: Servo = field(default_factory=Servo)
 
     def contradictions(self) -> Iterator[tuple[str, str, str]]:

@@ -1,0 +1,353 @@
+"""When a joint's gain, lag, offset or noise changed: change points with a level.
+
+The residual of a joint's response is regressed, in blocks of time, on one, on the response and on
+its rate: offset, relative gain and lag of each block; the logarithm of what is left is its noise.
+Where there are like joints, their median in the same block is taken off: what all do is no joint's
+change. For each run of blocks the mean inside is compared with that outside,
+
+    t = (m_in - m_out) / (s sqrt(r (1/W_in + 1/W_out))),
+
+with the weights W of the regressions, the scatter s within both parts, and r = (1 + rho)/(1 - rho)
+for the correlation rho from block to block, of which the median over the joints is taken, its bias
+of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi 10.1093/biomet/41.3-4.390).
+Student's t has as many degrees of freedom as there are independent blocks, less two. Level: half
+for the lasting changes, of which there are about b a joint and quantity, half for the passing ones,
+b^2/2 (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from scipy.special import stdtrit
+
+from ..common.arrays import BoolArray, FloatArray, IntArray
+from .exposure import ENOUGH_LIKE, REST_ERRORS, Exposure
+from .motion import Course, cycle_s
+
+LEVEL = 0.01
+"""Chance of any change in a session of healthy joints."""
+
+FEWEST = 8
+"""Blocks that a comparison needs (with fewer, 1 % of all changes has no threshold)."""
+
+MOST = 64
+"""Blocks that a course is divided into at most: onsets to 1.6 % of the record."""
+
+GAIN_MARGIN = 0.02
+"""Relative gain that matters: the margin of "alike"."""
+
+ANGLE_MARGIN_RAD = np.radians(1.0)
+"""Angle that matters [rad]: the margin of "alike"."""
+
+NOISE_MARGIN = np.log(2.0)
+"""Logarithm of the ratio of noise that matters: twice as much."""
+
+QUANTITIES = ("offset", "gain", "lag", "noise")
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A change of one quantity of one joint.
+
+    Attributes:
+        joint: Its index.
+        quantity: Of :data:`QUANTITIES`.
+        change: From before to after: [rad], relative to before, [s], logarithm of the ratio.
+        error: Its standard error.
+        first_s: When it changed [s].
+        last_s: When it was as before again [s]; inf for a lasting change.
+        block_s: Length of a block [s]: the times are known to half of it at best.
+    """
+
+    joint: int
+    quantity: str
+    change: float
+    error: float
+    first_s: float
+    last_s: float
+    block_s: float
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run of blocks ``first`` to ``last`` (exclusive) and how it differs from the others."""
+
+    change: float
+    error: float
+    first: int
+    last: int
+    drop: float  # of the sum of squares
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Estimates of k joints in b blocks, with the weights of each, shape (q, k, b)."""
+
+    values: FloatArray
+    weights: FloatArray
+    edges_s: FloatArray
+
+
+def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
+    """Find the largest change of each joint and quantity.
+
+    Args:
+        usable: Steps that are looked at, shape (k, n): without those at which a joint stands.
+
+    Returns:
+        Those beyond the level and the size that matters, joint by joint.
+    """
+    blocks = _blocks(course, exposure, usable)
+    if blocks is None:
+        return []
+    best: dict[int, tuple[float, Jump]] = {}
+    for q, quantity in enumerate(QUANTITIES):
+        values, weights = blocks.values[q], blocks.weights[q]
+        values, weights = _without_common(values, weights, exposure)
+        inflation = _inflation(values, weights)
+        tests = weights.shape[0] * len(QUANTITIES)
+        for k in range(weights.shape[0]):
+            run = _largest(values[k], weights[k], inflation, tests)
+            if run is None or abs(run.change) < _least(quantity, k, exposure, run, blocks):
+                continue
+            # Noise is what no other quantity explains.
+            drop = 0.0 if quantity == "noise" else run.drop
+            if k not in best or drop > best[k][0]:
+                best[k] = drop, _jump(k, quantity, run, blocks.edges_s)
+    return [best[k][1] for k in sorted(best)]
+
+
+def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
+    """Turn a run of blocks into a change; one that begins the record is undone at its end."""
+    change, first, last = run.change, run.first, run.last
+    count = edges_s.size - 1
+    if first == 0:
+        change, first, last = -change, last, count
+        if quantity == "gain":
+            change = change / (1 - change)
+    return Jump(
+        k,
+        quantity,
+        change,
+        run.error,
+        float(edges_s[first]),
+        inf if last == count else float(edges_s[last]),
+        float(edges_s[1] - edges_s[0]),
+    )
+
+
+def _least(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Blocks) -> float:
+    """Return the least change that matters; without like joints, one beyond the rest errors."""
+    alone = len(exposure.group(k)) == 1
+    rest = REST_ERRORS * exposure.rest_rad[k] if alone else 0.0
+    if quantity == "noise":  # of unlike joints it grows and falls with the motion
+        return inf if alone else float(NOISE_MARGIN)
+    if quantity == "offset":
+        return max(float(ANGLE_MARGIN_RAD), rest)
+    inside = slice(run.first, run.last)
+    _, motion, rate, count = blocks.weights[:, k, inside].sum(axis=1)
+    amplitude = max((2 * motion / max(count, 1)) ** 0.5, 1e-9)
+    if quantity == "gain":
+        return max(GAIN_MARGIN, rest / amplitude)
+    # One degree of a cycle, as an angle of the wave of that amplitude and rate.
+    return max(float(ANGLE_MARGIN_RAD) * amplitude, rest) / max(
+        (2 * rate / max(count, 1)) ** 0.5, 1e-9
+    )
+
+
+def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | None:
+    """Regress the residual of each joint in each block, of half cycles where there are cycles."""
+    length_s = float(course.t_s[-1] - course.t_s[0])
+    cycles = [cycle_s(command, course.step_s) / 2 for command in course.command]
+    half = max((cycle for cycle in cycles if np.isfinite(cycle)), default=0.0)
+    shortest = max(length_s / MOST, 2 * _correlation_s(course, exposure, usable))
+    whole = max(1.0, np.ceil(shortest / half)) * half if half else shortest
+    count = min(int(length_s / whole), MOST)
+    if count < FEWEST:
+        return None
+    width = course.t_s.size // count
+    starts = width * np.arange(count, dtype=np.int64)
+    joints = course.position.shape[0]
+    values = np.zeros((len(QUANTITIES), joints, count))
+    weights = np.zeros_like(values)
+    for k in range(joints):
+        residual = course.position[k] - exposure.fitted[k]
+        rate = np.gradient(exposure.fitted[k], course.step_s)
+        there = usable[k].astype(np.float64)
+        level = float(exposure.fitted[k] @ there) / max(float(there.sum()), 1.0)
+        residual, scatter = _tamed(residual, there, count, width)
+        rows = np.stack([np.ones_like(rate), exposure.fitted[k] - level, -rate, residual])
+        values[:3, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
+        # Below the usual noise no change is of interest.
+        values[3, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2 + 1e-12))
+    edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
+    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64))
+
+
+def _tamed(
+    residual: FloatArray, there: FloatArray, count: int, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Bring what is far from the middle of its block to the limit of :data:`TAME` deviations.
+
+    Returns:
+        The residual, shape (n,), and the robust standard deviation of each block, shape (b,).
+    """
+    blocks = np.where(there > 0, residual, np.nan)[: count * width].reshape(count, width)
+    known = np.isfinite(blocks).any(axis=1)
+    middle, scale = np.zeros((2, count, 1))
+    middle[known] = np.nanmedian(blocks[known], axis=1, keepdims=True)
+    scale[known] = ROBUST * np.nanmedian(np.abs(blocks - middle)[known], axis=1, keepdims=True)
+    limited = np.clip(blocks, middle - TAME * scale, middle + TAME * scale)
+    result = residual.copy()
+    result[: count * width] = np.nan_to_num(limited).ravel()
+    return result, scale[:, 0]
+
+
+ROBUST = 1.4826
+"""Standard deviation of normal values in their median distance from the middle."""
+
+TAME = 4
+"""Robust standard deviations of a block beyond which a sample has no more weight: of normal noise
+6 in 100,000 are, and single samples of heavy tails decide nothing (Huber)."""
+
+
+def _regressed(
+    weighted: FloatArray, rows: FloatArray, starts: IntArray, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return offset, gain and lag of each block, shape (3, b), and weights, shape (q, b)."""
+    stop = int(starts[-1]) + width
+    products = weighted[:, None, :stop] * rows[None, :, :stop]
+    moments = np.moveaxis(np.add.reduceat(products, starts, axis=2), 2, 0)
+    gram, target = moments[:, :3, :3], moments[:, :3, 3]
+    count = gram[:, 0, 0]
+    scale = np.sqrt(np.maximum(np.median(np.diagonal(gram, axis1=1, axis2=2), axis=0), 1e-30))
+    scaled = gram / scale[:, None] / scale[None, :]
+    # A block without motion knows its offset only: the ridge keeps the rest at 0, weightless.
+    ridge = np.diag([0.0, RIDGE, RIDGE])
+    inverse = np.linalg.inv(scaled + ridge + 1e-9 * np.eye(3)) / np.outer(scale, scale)
+    estimate = np.einsum("bij,bj->bi", inverse, target)
+    weights = np.concatenate(
+        [1 / np.maximum(np.diagonal(inverse, axis1=1, axis2=2).T, 1e-300), [count]]
+    )
+    weights[:, count < FULL * width] = 0
+    typical = np.median(weights, axis=1, keepdims=True)
+    weights[weights < INFORMED * typical] = 0
+    return estimate.T, weights
+
+
+SHORTEST = 2
+"""Blocks of a change, at least: one alone may hold a step of the command that no response fits."""
+
+FULL = 0.9
+"""Share of its steps that a block needs, so that whole cycles are compared with whole cycles."""
+
+RIDGE = 1e-3
+"""Ridge on gain and lag, relative to the median block: 0.1 % of what is known of them is lost."""
+
+INFORMED = 0.1
+"""Share of the median block's information below which a block is left out."""
+
+
+def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray) -> float:
+    """Return the median time after which the residuals' correlation is below 1/e."""
+    times: list[float] = []
+    for k in range(course.position.shape[0]):
+        residual = (course.position[k] - exposure.fitted[k])[usable[k]]
+        if residual.size < 2 * FEWEST:
+            continue
+        residual = residual - residual.mean()
+        spectrum = np.abs(np.fft.rfft(residual, 2 * residual.size)) ** 2
+        correlation = np.fft.irfft(spectrum)[: residual.size]
+        below = np.flatnonzero(correlation < correlation[0] / np.e)
+        times.append(float(below[0] if below.size else residual.size) * course.step_s)
+    return float(np.median(times)) if times else 0.0
+
+
+def _without_common(
+    values: FloatArray, weights: FloatArray, exposure: Exposure
+) -> tuple[FloatArray, FloatArray]:
+    """Take off each block the median of the like joints that are known in it.
+
+    Returns:
+        Values and weights; a block in which too few are known has no weight.
+    """
+    result, compared = values.copy(), weights.copy()
+    for k in range(values.shape[0]):
+        others = [j for j in exposure.group(k) if j != k]
+        if len(others) < ENOUGH_LIKE - 1:
+            continue
+        known = np.where(weights[others] > 0, values[others], np.nan)
+        enough = np.sum(weights[others] > 0, axis=0) >= ENOUGH_LIKE - 1
+        result[k, enough] -= np.nanmedian(known[:, enough], axis=0)
+        compared[k, ~enough] = 0
+    return result, compared
+
+
+def _inflation(values: FloatArray, weights: FloatArray) -> float:
+    """Return (1 + rho)/(1 - rho) of the median joint."""
+    found: list[float] = []
+    for value, weight in zip(values, weights, strict=True):
+        kept = value[weight > 0]
+        if kept.size >= FEWEST:
+            away = kept - np.median(kept)
+            away = np.clip(away, *(np.quantile(away, (0.05, 0.95))))
+            power = float(away @ away)
+            rho = float(away[1:] @ away[:-1]) / power if power > 0 else 0.0
+            found.append(rho + (1 + 4 * max(rho, 0.0)) / kept.size)
+    rho = min(max(float(np.median(found)), 0.0), 0.9) if found else 0.0
+    return (1 + rho) / (1 - rho)
+
+
+def _largest(values: FloatArray, weights: FloatArray, inflation: float, tests: int) -> _Run | None:
+    """Return the most certain run of blocks, or None if none is beyond the level."""
+    known = np.flatnonzero(weights > 0)
+    if known.size < FEWEST:
+        return None
+    v, w = values[known], weights[known]
+    best: tuple[float, _Run] | None = None
+    for lasting in (True, False):
+        first, last = _runs(known.size, lasting=lasting)
+        if not first.size:
+            continue
+        change, error = _tested(v, w, first, last, inflation)
+        freedom = max((known.size - 2) / inflation, 1.0)
+        limit = -float(stdtrit(freedom, LEVEL / 4 / tests / first.size))
+        t = np.abs(change) / error
+        k = int(np.argmax(t))
+        if t[k] > limit and (best is None or t[k] / limit > best[0]):
+            start = 0 if first[k] == 0 else int(known[first[k]])
+            stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
+            inner = float(w[first[k] : last[k]].sum())
+            drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
+            best = t[k] / limit, _Run(float(change[k]), float(error[k]), start, stop, drop)
+    return None if best is None else best[1]
+
+
+def _runs(count: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
+    """Return first block and the one after the last of runs to one end, or within."""
+    if lasting:
+        cuts = np.arange(SHORTEST, count - SHORTEST + 1)
+        half = cuts * 2 > count  # the shorter part is what changed
+        first = np.where(half, cuts, 0)
+        last = np.where(half, count, cuts)
+        return first, last
+    first, last = np.triu_indices(count, SHORTEST)
+    inner = (first > 0) & (last < count) & ((last - first) * 2 <= count)
+    return first[inner], last[inner]
+
+
+def _tested(
+    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, inflation: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return change and standard error of runs."""
+    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
+    inside = sums[:, last] - sums[:, first]
+    outside = sums[:, -1:] - inside
+    (wi, vi, si), (wo, vo, so) = inside, outside
+    change = vi / wi - vo / wo
+    squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
+    variance = squares / max(v.size - 2, 1) * inflation * (1 / wi + 1 / wo)
+    return change, np.sqrt(np.maximum(variance, 1e-300))

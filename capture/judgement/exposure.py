@@ -1,0 +1,187 @@
+"""Where a joint had to move: only there can it fail to follow.
+
+A joint has to move in a time window if a healthy one like it would move there by more than three
+times the rest error, after its delay and settling. Neither comes from the judged joint alone: the
+healthy response is the median over the joints like it, or the command itself without such, and the
+rest error (dead band, sag, encoder step, noise) is the median of what the responses of the like
+joints leave; without like joints the most that the others leave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import BoolArray, FloatArray
+from .motion import Course, JointMotion
+from .response import SETTLED, Filtered, Response
+
+REST_ERRORS = 3
+"""Rest errors beyond which a motion is asked for: one at either end is lost in a dead band, and one
+is noise."""
+
+LARGEST_REST_RAD = np.radians(3.0)
+"""Largest rest error without a description [rad]: play and steps of hobby servos are below."""
+
+ENOUGH_LIKE = 4
+"""Joints that a common response needs, so that one faulty joint doesn't move their median."""
+
+RESPONDS = 1 / 4
+"""Gain from which a joint responds: play within the rest error leaves a third of the least motion
+that is judged."""
+
+COHERENT = 1 / 2
+"""Explained share from which a response is one: with less, most of the motion is something else."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What healthy joints like these k joints would do on n steps.
+
+    Attributes:
+        healthy: Position of a healthy joint [rad], shape (k, n).
+        fitted: By its response of its own [rad], shape (k, n).
+        responses: Of the joints, k.
+        like: Group of joints like it, shape (k,); joints of no group have numbers of their own.
+        rest_rad: Rest error [rad], shape (k,).
+        least_rad: Motion that has to be asked for to judge a joint [rad], shape (k,): three rest
+            errors, and what a healthy joint may lose besides what its own response leaves.
+        settling_s: Delay and settling of healthy joints [s], shape (k,).
+    """
+
+    healthy: FloatArray
+    fitted: FloatArray
+    responses: tuple[Response, ...]
+    like: tuple[int, ...]
+    rest_rad: FloatArray
+    least_rad: FloatArray
+    settling_s: FloatArray
+
+    def group(self, joint: int) -> list[int]:
+        """Return the joints like one, itself included."""
+        return [k for k, number in enumerate(self.like) if number == self.like[joint]]
+
+
+def exposure_of(
+    course: Course, motions: Sequence[JointMotion], responses: Sequence[Response]
+) -> Exposure:
+    """Compute where joints had to move.
+
+    Args:
+        course: Of k joints.
+        motions: The same joints.
+        responses: The same joints' fitted responses.
+    """
+    filtered = [Filtered(command[None, :], course.step_s) for command in course.command]
+    like = _like(motions, responses)
+    residual = np.empty_like(course.position)
+    fitted = np.empty_like(course.position)
+    healthy = np.empty_like(course.position)
+    lost = np.zeros(len(motions))
+    settling = np.zeros(len(motions))
+    for k, response in enumerate(responses):
+        fitted[k] = response.offset_rad + response.gain * filtered[k].output(response)[0]
+        residual[k] = course.position[k] - fitted[k]
+        lost[k] = _lost_motion(residual[k][course.present[k]])
+    rest = np.empty(len(motions))
+    for k, response in enumerate(responses):
+        group = [j for j, number in enumerate(like) if number == like[k]]
+        sound = [responses[j] for j in group if _responds(responses[j])]
+        common = _median_response(sound) if len(group) >= ENOUGH_LIKE and sound else Response(1.0)
+        offset = response.offset_rad
+        healthy[k] = offset + common.gain * filtered[k].output(common)[0]
+        others = [j for j in range(len(motions)) if j != k]
+        if len(group) >= ENOUGH_LIKE:
+            pooled = float(np.median(lost[group]))
+        else:  # of joints unlike each other the worst may be the one that is like it
+            pooled = float(np.max(lost[others])) if others else float(LARGEST_REST_RAD)
+        rest[k] = min(pooled, float(LARGEST_REST_RAD))
+        known = sound or [r for r in responses if _responds(r)]
+        settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
+    own = np.minimum(lost, LARGEST_REST_RAD)
+    least = np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own)
+    settling += course.step_s
+    return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
+
+
+def _responds(response: Response) -> bool:
+    return response.gain >= RESPONDS and response.explained >= COHERENT
+
+
+def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tuple[int, ...]:
+    """Number the groups of joints that are like by their description, or else by most of them."""
+    kinds = [motion.kind for motion in motions]
+    if all(kind is not None for kind in kinds):
+        names = list(dict.fromkeys(kinds))
+        return tuple(names.index(kind) for kind in kinds)
+    sound = [response for response in responses if _responds(response)]
+    if len(sound) < ENOUGH_LIKE or 3 * len(sound) < 2 * len(responses):
+        return tuple(range(len(motions)))
+    common = _median_response(sound)
+    agree = [_agrees(response, common) for response in responses]
+    if sum(agree) < max(ENOUGH_LIKE, 2 * len(responses) / 3):
+        return tuple(range(len(motions)))
+    return (0,) * len(motions)
+
+
+def _agrees(response: Response, common: Response) -> bool:
+    """Return whether a response is a common one, up to a profile along the body."""
+    return abs(response.gain / common.gain - 1) < RESPONDS and (
+        abs(response.lag_s - common.lag_s) < max(RESPONDS * common.lag_s, LIKE_LAG_S)
+    )
+
+
+LIKE_LAG_S = 0.05
+"""Difference in lag up to which joints may be of one kind [s]: two control periods of a slow bus
+(40 Hz)."""
+
+
+def _median_response(responses: Sequence[Response]) -> Response:
+    """Return the response of the joint of median lag, with the median gain."""
+    lags = np.array([response.lag_s for response in responses])
+    middle = responses[int(np.argsort(lags)[(lags.size - 1) // 2])]
+    gain = float(np.median([response.gain for response in responses]))
+    return Response(gain, 0.0, middle.delay_s, middle.constant_s, middle.order, middle.damping)
+
+
+def _lost_motion(residual: FloatArray) -> float:
+    """Return half the width that holds 95 % of a residual: two standard deviations of noise."""
+    if residual.size == 0:
+        return 0.0
+    low, high = np.quantile(residual, (0.025, 0.975))
+    return float(high - low) / 2
+
+
+def window_ranges(values: FloatArray, lengths: Sequence[int]) -> list[FloatArray]:
+    """Return the range of values in all windows of some lengths, each by doubling.
+
+    Args:
+        values: Shape (n,).
+        lengths: Samples of a window, 1 to n each, increasing.
+
+    Returns:
+        For each length m: largest minus smallest value from each start, shape (n - m + 1,).
+    """
+    high, low, width = values, values, 1
+    found: list[FloatArray] = []
+    for length in lengths:
+        while 2 * width <= length:
+            high = np.maximum(high[:-width], high[width:])
+            low = np.minimum(low[:-width], low[width:])
+            width *= 2
+        rest = length - width
+        top = np.maximum(high[: high.size - rest], high[rest:]) if rest else high
+        bottom = np.minimum(low[: low.size - rest], low[rest:]) if rest else low
+        found.append(top - bottom)
+    return found
+
+
+def covered(starts: BoolArray, length: int, size: int) -> BoolArray:
+    """Mark the samples of all windows that begin at marked starts, shape (size,)."""
+    change = np.zeros(size + 1, dtype=np.int64)
+    index = np.flatnonzero(starts)
+    np.add.at(change, index, 1)
+    np.add.at(change, index + length, -1)
+    return np.asarray(np.cumsum(change)[:-1] > 0, dtype=np.bool_)

@@ -1,0 +1,133 @@
+"""What a judgement finds: faults, changes, motion of its own, rests off the command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Span = tuple[float, float]
+"""Start and end [s]."""
+
+KINDS: dict[str, tuple[str, str]] = {
+    "dead": ("mechanics", "the motor does not drive the joint"),
+    "jammed": ("mechanics", "the joint is blocked"),
+    "stalled": ("mechanics", "the motor pushes with constant effort and the joint stands still"),
+    "inverted": ("mechanics", "the joint moves against its command"),
+    "intermittent": ("mechanics", "the joint stops following for some time, again and again"),
+    "at_limit": ("mechanics", "the joint is at a limit"),
+    "slipped": ("mechanics", "the joint slipped against its motor"),
+    "swapped": ("wiring", "two joints carry out each other's command"),
+    "frozen_sensor": ("sensor", "the sensor repeats one value"),
+    "inverted_sensor": ("sensor", "the sensor counts the wrong way"),
+    "stale_sensor": ("sensor", "the sensor repeats old values"),
+    "scaled_sensor": ("sensor", "the sensor's scale or unit is wrong"),
+    "slipped_sensor": ("sensor", "the sensor's zero moved by a step"),
+    "noisy_sensor": ("sensor", "the sensor is noisy for some time"),
+    "wrapped_sensor": ("sensor", "the sensor's counter wrapped around"),
+    "drifting_sensor": ("sensor", "the sensor's zero drifts"),
+    "clipped_sensor": ("sensor", "the sensor's range ends before the motion"),
+    "lost_samples": ("record", "samples of the joint are missing"),
+    "unknown": ("unknown", "something changed"),
+}
+"""Kind of fault to where it lies and what it is."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One joint that does not follow its command.
+
+    Attributes:
+        kinds: The kinds of :data:`KINDS` that fit and that the data can't separate.
+        spans_s: When it holds, from the common origin [s].
+        since_s: Start of the first span [s]; None where it holds from the beginning.
+        until_s: End of the last span [s]; None where it holds to the end.
+        share: Share of the time in which it was asked to move in which it holds, 0 to 1.
+        evidence: What the data show, in words.
+    """
+
+    joint: str
+    kinds: tuple[str, ...]
+    spans_s: tuple[Span, ...]
+    since_s: float | None
+    until_s: float | None
+    share: float
+    evidence: str
+
+    @property
+    def about(self) -> str:
+        """``mechanics``, ``wiring``, ``sensor`` or ``record``; several joined by ``or``."""
+        return " or ".join(dict.fromkeys(KINDS[kind][0] for kind in self.kinds))
+
+
+@dataclass(frozen=True)
+class Change:
+    """A joint whose response changed during the session: a difference, no fault.
+
+    Attributes:
+        quantity: ``gain``, ``lag``, ``offset`` or ``noise``.
+        change: Relative to before for ``gain``; [s] for ``lag``, [rad] for ``offset``; the ratio
+            to before for ``noise``.
+        half_width: Of its simultaneous 95 % interval; of the logarithm for ``noise``.
+        from_s: When it began, from the session's start [s].
+        until_s: When it was as before again [s]; None for a lasting change.
+        onset_s: Interval of the beginning [s].
+    """
+
+    joint: str
+    quantity: str
+    change: float
+    half_width: float
+    from_s: float
+    until_s: float | None
+    onset_s: Span
+
+
+@dataclass(frozen=True)
+class ExtraMotion:
+    """A joint that also moves at a frequency that isn't its command's.
+
+    Attributes:
+        frequency_hz: [Hz].
+        amplitude_rad: [rad].
+    """
+
+    joint: str
+    frequency_hz: float
+    amplitude_rad: float
+
+
+@dataclass(frozen=True)
+class RestsOff:
+    """A joint that rests off its command.
+
+    Attributes:
+        offset_rad: Position less command at rest, the largest [rad].
+        range_rad: The least and the largest [rad].
+        rests: Number of rests.
+    """
+
+    joint: str
+    offset_rad: float
+    range_rad: tuple[float, float]
+    rests: int
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is found of the joints of a session.
+
+    Attributes:
+        faults: At most one a joint, in the order of the joints.
+        changes: Of joints without a fault.
+        extra: Of joints without a fault.
+        rests: Of joints without a fault.
+        unexposed: Joints that were not asked to move enough to judge, with the largest motion that
+            was asked of them [rad].
+        judged: Joints that were.
+    """
+
+    faults: tuple[Fault, ...] = ()
+    changes: tuple[Change, ...] = ()
+    extra: tuple[ExtraMotion, ...] = ()
+    rests: tuple[RestsOff, ...] = ()
+    unexposed: tuple[tuple[str, float], ...] = ()
+    judged: tuple[str, ...] = ()

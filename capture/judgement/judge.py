@@ -1,0 +1,210 @@
+"""The judgement of a session's joints: who doesn't follow, who changed, and what else differs.
+
+A joint is accused where it stands although it had to move, moves against its command or not with
+it, in another scale, or by another joint's command; or where its record is incomplete. What an
+explanation of healthy joints covers, a gain, a delay, a rest off the command, a change, is a
+difference and no fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+
+import numpy as np
+
+from ..common.arrays import BoolArray, merged_ranges
+from ..common.process import in_threads
+from .changes import Jump, find_jumps
+from .exposure import COHERENT, RESPONDS, REST_ERRORS, Exposure, exposure_of
+from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
+from .lines import find_lines
+from .motion import Course, JointMotion, course_of
+from .record import record_faults
+from .response import BLOCKS, Response, fit_response
+from .rests import find_rests
+from .standing import opposite_kinds, standing_kinds
+from .stillness import Stillness, stillness_of, usable_steps
+
+WHOLE = 2 / 3
+"""Share of its exposed time from which a fault holds throughout: what the trimmed response can't
+have left out."""
+
+UNIT_SLACK = 1.6
+"""Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it."""
+
+ORDERLY = 0.8
+"""Explained share of the other joints beside which one that follows nothing stands out."""
+
+WIDTH = 1.96
+"""Standard errors of a 95 % interval."""
+
+LEAST_RANGE_RAD = 1e-3
+"""A command that moves less is held still [rad]: a step of a 12-bit encoder is 1.5e-3."""
+
+
+def judge(motions: Sequence[JointMotion]) -> Judgement:
+    """Judge the joints of a session.
+
+    Args:
+        motions: All joints that have a command, in chain order.
+    """
+    record = record_faults(motions)
+    driven = [m for m in motions if m.command.range > LEAST_RANGE_RAD and _lasts(m)]
+    course = course_of(driven)
+    if course is None:
+        faults = [record[m.name] for m in motions if m.name in record]
+        return Judgement(tuple(faults))
+    samples = course.position.size
+
+    def response_of(k: int) -> Response:
+        return fit_response(course.command[k], course.position[k], course.present[k], course.step_s)
+
+    responses = in_threads(response_of, range(len(driven)), samples)
+    exposure = exposure_of(course, driven, responses)
+    stillness = stillness_of(course, exposure)
+    faults = _faults(course, driven, exposure, stillness)
+    for name, fault in record.items():
+        # Missing samples are no reason for anything else; a counter's turns and old values are.
+        if name not in faults or "lost_samples" not in fault.kinds:
+            faults[name] = fault
+    usable = usable_steps(course, exposure, stillness)
+    healthy = np.array([motion.name not in faults for motion in driven])
+    usable &= healthy[:, None]
+    names = [motion.name for motion in driven]
+    exposed: BoolArray = np.any(stillness.exposed, axis=1)
+    return Judgement(
+        faults=tuple(faults[m.name] for m in motions if m.name in faults),
+        changes=tuple(_change(names, jump) for jump in find_jumps(course, exposure, usable)),
+        extra=tuple(
+            ExtraMotion(names[line.joint], line.frequency_hz, line.amplitude_rad)
+            for line in find_lines(course, exposure, usable)
+        ),
+        rests=tuple(
+            RestsOff(names[rest.joint], rest.offset_rad, rest.range_rad, rest.rests)
+            for rest in find_rests(course, exposure, stillness)
+            if healthy[rest.joint]
+        ),
+        unexposed=tuple(
+            (name, float(np.ptp(course.command[k])))
+            for k, name in enumerate(names)
+            if not exposed[k]
+        ),
+        judged=tuple(name for k, name in enumerate(names) if exposed[k]),
+    )
+
+
+def _lasts(motion: JointMotion) -> bool:
+    """Return whether command and position overlap, with samples for the blocks of a fit."""
+    command, position = motion.command.t_s, motion.position.t_s
+    if min(command.size, position.size) < 2:
+        return False
+    start, stop = max(command[0], position[0]), min(command[-1], position[-1])
+    return bool(np.count_nonzero((position >= start) & (position <= stop)) >= BLOCKS)
+
+
+def _faults(
+    course: Course, driven: Sequence[JointMotion], exposure: Exposure, stillness: Stillness
+) -> dict[str, Fault]:
+    """Return the faults of joints that had to move, by name."""
+    faults: dict[str, Fault] = {}
+    explained = np.array([response.explained for response in exposure.responses])
+    common = _common_stands(stillness)
+    for k, motion in enumerate(driven):
+        response = exposure.responses[k]
+        if not stillness.exposed[k].any():
+            continue
+        like = [driven[j] for j in exposure.group(k)]
+        others = np.delete(explained, k)
+        stands = stillness.stands[k] & ~common
+        share = float(stands.sum()) / max(int(stillness.exposed[k].sum()), 1)
+        if response.gain < -RESPONDS and response.explained > COHERENT:
+            kinds, why = opposite_kinds(motion)
+            text = f"moves against its command, gain {response.gain:.2f}"
+            faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
+        elif (unit := _unit_factor(k, exposure)) is not None:
+            text = f"moves {unit} times as far as commanded"
+            faults[motion.name] = _whole(motion, ("scaled_sensor",), text)
+        elif stands.any():
+            spans = tuple(_trimmed(span, course, k, exposure) for span in _spans(stands, course))
+            kinds, why = standing_kinds(motion, spans, like)
+            if len(spans) > 1 and "at_limit" not in kinds:
+                kinds = ("intermittent", *kinds)
+            text = _stood(spans, course, k, exposure)
+            text = f"{text}; {why}" if why else text
+            faults[motion.name] = _fault(motion, kinds, spans, share, text)
+        elif response.explained < COHERENT and others.size and np.median(others) > ORDERLY:
+            text = f"its command explains {100 * response.explained:.0f} % of its motion"
+            faults[motion.name] = _whole(motion, ("dead", "noisy_sensor"), text)
+    return faults
+
+
+def _common_stands(stillness: Stillness) -> BoolArray:
+    """Mark the steps at which most joints that have to move stand: no fault of one of them."""
+    exposed, stands = stillness.exposed.sum(axis=0), stillness.stands.sum(axis=0)
+    common = (2 * stands > exposed) & (stands > 2)
+    # Throughout it is none: no joint follows.
+    return common if common.sum() < WHOLE * np.count_nonzero(exposed) else np.zeros_like(common)
+
+
+def _unit_factor(k: int, exposure: Exposure) -> str | None:
+    """Return the factor between degrees and radians that a gain shows, in words."""
+    response = exposure.responses[k]
+    if response.explained < COHERENT or response.gain <= 0:
+        return None
+    for factor, text in ((np.degrees(1.0), "180/pi"), (np.radians(1.0), "pi/180")):
+        if abs(np.log(response.gain / factor)) < np.log(UNIT_SLACK):
+            return text
+    return None
+
+
+def _spans(marked: BoolArray, course: Course) -> tuple[Span, ...]:
+    """Return the marked steps as time spans [s]; gaps of a few steps are closed."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
+    times = course.t_s[0] + course.step_s * edges.reshape(-1, 2)
+    return tuple(merged_ranges([(float(a), float(b)) for a, b in times], BLOCKS * course.step_s))
+
+
+def _trimmed(span: Span, course: Course, k: int, exposure: Exposure) -> Span:
+    """Take off the ends of a span at which the joint is still on its way."""
+    inside = np.flatnonzero((course.t_s >= span[0]) & (course.t_s < span[1]))
+    position = course.position[k, inside]
+    near = np.abs(position - np.median(position)) <= REST_ERRORS * exposure.rest_rad[k]
+    there = course.t_s[inside[near]]
+    return float(there[0]), float(there[-1]) + course.step_s
+
+
+def _stood(spans: Sequence[Span], course: Course, k: int, exposure: Exposure) -> str:
+    """Say how far a joint moved, and how far it had to, in the longest span."""
+    start, stop = max(spans, key=lambda span: span[1] - span[0])
+    inside = (course.t_s >= start) & (course.t_s < stop)
+    moved = np.degrees(np.ptp(course.position[k, inside]))
+    asked = np.degrees(np.ptp(exposure.healthy[k, inside]))
+    return f"moves {moved:.1f} of {asked:.1f} degrees in {stop - start:.1f} s"
+
+
+def _whole(motion: JointMotion, kinds: tuple[str, ...], evidence: str) -> Fault:
+    return Fault(motion.name, kinds, (), None, None, 1.0, evidence)
+
+
+def _fault(
+    motion: JointMotion, kinds: tuple[str, ...], spans: tuple[Span, ...], share: float, text: str
+) -> Fault:
+    """Build a fault; one that holds throughout has no times."""
+    if share > WHOLE and len(spans) == 1:
+        begin, end = float(motion.position.t_s[0]), float(motion.position.t_s[-1])
+        near = (1 - WHOLE) * (end - begin) / BLOCKS
+        since = spans[0][0] if spans[0][0] - begin > near else None
+        until = spans[0][1] if end - spans[0][1] > near else None
+        return Fault(motion.name, kinds, spans, since, until, min(share, 1.0), text)
+    end = float(motion.position.t_s[-1])
+    until = None if end - spans[-1][1] < motion.position.period_s * BLOCKS else spans[-1][1]
+    return Fault(motion.name, kinds, spans, spans[0][0], until, min(share, 1.0), text)
+
+
+def _change(names: Sequence[str], jump: Jump) -> Change:
+    size = float(np.exp(jump.change)) if jump.quantity == "noise" else jump.change
+    until = jump.last_s if isfinite(jump.last_s) else None
+    onset = jump.first_s - jump.block_s, jump.first_s + jump.block_s
+    half_width = WIDTH * jump.error
+    return Change(names[jump.joint], jump.quantity, size, half_width, jump.first_s, until, onset)

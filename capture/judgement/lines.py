@@ -1,0 +1,112 @@
+"""What a joint moves besides its response: lines of the residual's spectrum.
+
+Thomson's harmonic F test (Proc. IEEE 70, 1982, doi 10.1109/PROC.1982.12433, eq. 13.10) over sine
+tapers (Riedel & Sidorenko, IEEE Trans. Signal Process. 43, 1995, doi 10.1109/78.365298): with the
+transforms y_k(f) of the tapered residual and the tapers' sums h_k, the line's complex amplitude is
+
+    a(f) = sum_k h_k y_k(f) / sum_k h_k^2,
+    F(f) = (K - 1) |a|^2 sum_k h_k^2 / sum_k |y_k - a h_k|^2,
+
+which without a line has Fisher's F distribution with 2 and 2K - 2 degrees of freedom; its tail is
+(1 + F / (K - 1))^-(K - 1) in closed form. Bonferroni over the frequencies and joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import BoolArray, ComplexArray, FloatArray
+from .changes import ANGLE_MARGIN_RAD, LEVEL
+from .exposure import REST_ERRORS, Exposure
+from .motion import Course, cycle_s
+
+TAPERS = 8
+"""Sine tapers: 14 degrees of freedom of the noise, with lines resolved to 8 cycles a record."""
+
+NEIGHBOURS = 2
+"""How many times the line of like joints a line is, at least, to be a joint's own."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A motion at one frequency that is no response to the command.
+
+    Attributes:
+        joint: Its index.
+        frequency_hz: [Hz].
+        amplitude_rad: [rad].
+    """
+
+    joint: int
+    frequency_hz: float
+    amplitude_rad: float
+
+
+def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Line]:
+    """Find the largest line of each joint that like joints don't have.
+
+    Args:
+        usable: Steps that are looked at, shape (k, n); elsewhere the residual counts as zero.
+    """
+    count, size = course.position.shape
+    frequency = np.asarray(np.fft.rfftfreq(size, course.step_s), dtype=np.float64)
+    residual = np.where(usable, course.position - exposure.fitted, 0.0)
+    residual -= np.mean(residual, axis=1, keepdims=True)
+    amplitude, tail = np.empty((2, count, frequency.size))
+    for k in range(count):
+        amplitude[k], tail[k] = _tested(residual[k])
+    tests = count * frequency.size
+    lines: list[Line] = []
+    for k in range(count):
+        others = [j for j in exposure.group(k) if j != k]
+        common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
+        least = max(float(ANGLE_MARGIN_RAD), REST_ERRORS * _rest_within(exposure, k))
+        sure = (tail[k] < LEVEL / tests) & (amplitude[k] > least)
+        sure &= (amplitude[k] > NEIGHBOURS * common) & _free(
+            frequency, course, k, like=len(others) > 2
+        )
+        if sure.any():
+            best = int(np.argmax(np.where(sure, amplitude[k], 0)))
+            lines.append(Line(k, float(frequency[best]), float(amplitude[k, best])))
+    return lines
+
+
+def _rest_within(exposure: Exposure, k: int) -> float:
+    """Return the rest error of a joint where it isn't shared by like joints, else 0."""
+    return float(exposure.rest_rad[k]) if len(exposure.group(k)) == 1 else 0.0
+
+
+def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolArray:
+    """Mark the frequencies that are neither drift nor, without like joints, the gait's.
+
+    Stick and friction make motion at multiples of the gait's frequency, which like joints share.
+    """
+    resolved = (TAPERS + 1) / (2 * course.t_s.size * course.step_s)
+    free = frequency > 2 * resolved
+    cycle = cycle_s(course.command[k], course.step_s)
+    if np.isfinite(cycle) and not like:
+        free &= np.abs(frequency - np.round(frequency * cycle) / cycle) > resolved
+    return np.asarray(free, dtype=np.bool_)
+
+
+def _tested(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return amplitude of a line and chance of it without one, at each frequency."""
+    size = residual.size
+    steps = np.arange(1, size + 1)
+    power, projected = np.zeros((2, size // 2 + 1))
+    weighted = np.zeros(size // 2 + 1, dtype=np.complex128)
+    sums = 0.0
+    for k in range(1, TAPERS + 1):
+        taper = (2 / (size + 1)) ** 0.5 * np.sin(np.pi * k * steps / (size + 1))
+        transformed: ComplexArray = np.fft.rfft(taper * residual)
+        total = float(taper.sum())
+        weighted += total * transformed
+        power += np.abs(transformed) ** 2
+        sums += total**2
+    projected = np.abs(weighted) ** 2 / sums
+    left = np.maximum(power - projected, 1e-300)
+    statistic = (TAPERS - 1) * projected / left
+    tail = (1 + statistic / (TAPERS - 1)) ** -(TAPERS - 1)
+    return 2 * np.abs(weighted) / sums, np.asarray(tail, dtype=np.float64)

@@ -1,0 +1,149 @@
+"""Faults of a joint's record: samples that are missing, repeated, or off by a counter's turns.
+
+Each is counted beyond what the joints of the session have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import bdtrc
+
+from ..common.arrays import FloatArray
+from ..common.process import in_threads
+from .fault import Fault, Span
+from .motion import JointMotion
+
+LOST = 0.01
+"""Share of a joint's samples that may be missing beyond what the joints have in common: of a
+thousand intervals a serial bus with retries drops up to ten."""
+
+STALE = 0.15
+"""Share of the fast samples that may repeat the one before, beyond what all joints do: a bus that
+is read faster than its servos answer."""
+
+RARE = 1e-6
+"""Chance of so many repeats from which they are old values: one in a million joints."""
+
+LONGEST = 8
+"""Repeats in turn beyond which a joint stands, or its sensor froze."""
+
+GAP = 1.8
+"""Median intervals from which one lacks a sample: jitter of 80 % is none."""
+
+SILENT = 0.02
+"""Share of the record from which a gap is a silence, which is reported with its times."""
+
+MOSTLY = 0.8
+"""Share of what is missing, or of the steps, that a single explanation covers."""
+
+TURNS = (2 * np.pi, 4 * np.pi, np.pi, np.radians(300.0), 360.0, 4096.0, 65536.0)
+"""Turns of counters: of a shaft, of half and double shafts, of a hobby servo, in raw units."""
+
+SAME = 0.1
+"""Relative difference within which steps are turns of one counter."""
+
+WRAP = 5
+"""Times the command's largest step from which a step is no motion."""
+
+
+def record_faults(motions: Sequence[JointMotion]) -> dict[str, Fault]:
+    """Find joints whose positions are missing, repeated or off by turns, by name."""
+    sampled = [motion for motion in motions if motion.position.t_s.size > 2]
+
+    def counts(motion: JointMotion) -> tuple[float, int, int, str]:
+        return _lost(motion), *_repeats(motion), _wraps(motion)
+
+    total = sum(motion.position.t_s.size for motion in sampled)
+    found = in_threads(counts, sampled, total)
+    usual_lost = float(np.median([lost for lost, *_ in found] or [0.0]))
+    usual_stale = float(np.median([repeats / of for _, repeats, of, _ in found if of] or [0.0]))
+    expected = min(STALE + 2 * usual_stale, 1.0)
+    faults: dict[str, Fault] = {}
+    for motion, (missing, repeats, fast, wrapped) in zip(sampled, found, strict=True):
+        name = motion.name
+        if wrapped:
+            faults[name] = _whole(name, ("wrapped_sensor",), wrapped)
+        elif bdtrc(repeats - 1, fast, expected) < RARE:
+            text = f"{100 * repeats / fast:.2g} % of its fast samples repeat the one before"
+            faults[name] = _whole(name, ("stale_sensor", "lost_samples"), text)
+        elif missing > LOST + 2 * usual_lost:
+            text = f"lacks samples, {100 * missing:.2g} % of its samples missing"
+            faults[name] = _whole(name, ("lost_samples",), text, _silences(motion, missing))
+    for motion in motions:
+        if motion.position.t_s.size <= 2 < motion.command.t_s.size and sampled:
+            text = "lacks samples, no position was recorded"
+            faults[motion.name] = _whole(motion.name, ("lost_samples",), text)
+    return faults
+
+
+def _whole(name: str, kinds: tuple[str, ...], text: str, spans: tuple[Span, ...] = ()) -> Fault:
+    since, until = (spans[0][0], spans[-1][1]) if spans else (None, None)
+    return Fault(name, kinds, spans, since, until, 1.0, text)
+
+
+def _lost(motion: JointMotion) -> float:
+    """Share of the samples that are missing or not finite."""
+    samples = motion.position
+    step, usual = np.diff(samples.t_s), samples.period_s
+    gaps = step[step > GAP * usual]
+    absent = float(np.sum(np.round(gaps / usual) - 1)) if gaps.size else 0.0
+    # A record of one message per servo may end early: what lacks at the ends counts, too.
+    if (commanded := motion.command.t_s).size:
+        edges = max(0.0, samples.t_s[0] - commanded[0]) + max(0.0, commanded[-1] - samples.t_s[-1])
+        absent += max(0.0, edges / usual - 2)
+    return absent / (samples.t_s.size + absent)
+
+
+def _silences(motion: JointMotion, missing: float) -> tuple[Span, ...]:
+    """Return the gaps if a few long ones hold most missing samples; else none."""
+    t_s = motion.position.t_s
+    step = np.diff(t_s)
+    length = float(t_s[-1] - t_s[0])
+    long = np.flatnonzero(step > SILENT * length)
+    if not long.size or float(step[long].sum()) < MOSTLY * missing * length:
+        return ()
+    return tuple(zip(t_s[long].tolist(), t_s[long + 1].tolist(), strict=True))
+
+
+def _repeats(motion: JointMotion) -> tuple[int, int]:
+    """Count the samples during fast motion that repeat the one before, and all of them."""
+    values = motion.position.values
+    step = np.abs(np.diff(values))
+    moved = step[step > 0]
+    half = LONGEST // 2
+    if moved.size < LONGEST or values.size < 2 * LONGEST:
+        return 0, 0
+    # Its own motion over a few samples: a joint that stands repeats its values rightly.
+    travel = np.abs(values[LONGEST:] - values[:-LONGEST]) / LONGEST
+    travel = np.pad(travel, (half, half - 1), mode="edge")
+    fast = travel > np.maximum(2 * moved.min(), np.quantile(travel, 0.95) / 2)
+    repeated = step == 0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], repeated.astype(np.int8), [0]])))
+    for first, stop in edges.reshape(-1, 2).tolist():
+        if stop - first > LONGEST:
+            repeated[first:stop] = False
+    return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))
+
+
+def _wraps(motion: JointMotion) -> str:
+    """Describe the steps of a counter that wraps around, if there are such.
+
+    They have one size, that of a known turn, go up and down, and are larger than the command ever
+    moves between two samples and than half of its range.
+    """
+    samples = motion.position
+    step = np.diff(samples.values)
+    asked = np.abs(np.diff(motion.command.at(samples.t_s)))
+    largest = float(asked.max()) if asked.size else 0.0
+    large: FloatArray = step[np.abs(step) > max(WRAP * largest, motion.command.range / 2)]
+    if not 2 <= large.size <= step.size / WRAP:
+        return ""
+    turn = float(np.median(np.abs(large)))
+    known = min(abs(turn / size - 1) for size in TURNS) < SAME
+    near = np.abs(np.abs(large) / turn - 1) < SAME
+    balance = abs(float(np.sum(np.sign(large))))
+    if not known or np.mean(near) < MOSTLY or balance > max(1.0, large.size / WRAP):
+        return ""
+    return f"{large.size} steps of {np.degrees(turn):.0f} degrees"

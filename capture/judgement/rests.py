@@ -1,0 +1,67 @@
+"""Where a joint rests off its command, as soft servos under load do.
+
+The command rests where it moves less than an encoder would show for longer than the settling; the
+mean of the position less the command there, over the rests of a session, is the rest's error. It is
+a difference, no fault: proportional control without an integral part leaves it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import FloatArray
+from .exposure import LARGEST_REST_RAD, Exposure
+from .motion import Course
+from .stillness import Stillness
+
+RESTING = 1e-3
+"""Share of the command's range within which it rests: a step of a 10-bit servo."""
+
+
+@dataclass(frozen=True)
+class RestOff:
+    """A joint that rests off its command.
+
+    Attributes:
+        joint: Its index.
+        offset_rad: The largest position less command at rest [rad].
+        range_rad: The least and the largest of the rests [rad].
+        rests: Number of rests.
+    """
+
+    joint: int
+    offset_rad: float
+    range_rad: tuple[float, float]
+    rests: int
+
+
+def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list[RestOff]:
+    """Find the joints that rest off by more than healthy joints do."""
+    found: list[RestOff] = []
+    for k in range(course.position.shape[0]):
+        off = _rests(course, exposure, stillness, k)
+        if not off:
+            continue
+        most = max(off, key=abs)
+        if abs(most) > LARGEST_REST_RAD:
+            found.append(RestOff(k, most, (min(off), max(off)), len(off)))
+    return found
+
+
+def _rests(course: Course, exposure: Exposure, stillness: Stillness, k: int) -> list[float]:
+    """Return the mean error of each rest, its beginning left out [rad]."""
+    command = course.command[k]
+    moves = np.abs(np.diff(command, prepend=command[0])) > RESTING * np.ptp(command)
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], moves, [True]]).astype(np.int8)))
+    settled = int(np.ceil(exposure.settling_s[k] / course.step_s)) + 1
+    off: list[float] = []
+    for first, last in ends.reshape(-1, 2).tolist():
+        if last - first >= 2 * settled:
+            there = slice(first + settled, last)
+            kept = course.present[k, there] & ~stillness.stands[k, there]
+            error: FloatArray = (course.position[k] - command)[there][kept]
+            if error.size >= settled:
+                off.append(float(np.mean(error)))
+    return off

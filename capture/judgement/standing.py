@@ -1,0 +1,183 @@
+"""Kinds of a joint that stands still, or moves the wrong way: what other channels prove.
+
+A servo computes effort and velocity from its own encoder: with a frozen encoder it pushes as
+against a block. So they tell a frozen sensor from a jammed joint only where they are measured
+outside of its loop; a second position sensor always is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..common.arrays import BoolArray, FloatArray
+from .exposure import RESPONDS
+from .fault import Span
+from .motion import JointMotion, Samples
+
+POWERLESS = 0.15
+"""Share of the usual effort below which a motor doesn't drive its joint: the friction of geared
+hobby servos without load is a tenth of their torque."""
+
+PUSHES = 1.5
+"""Times the usual effort from which a motor pushes against something: of a sine the mean size is
+2/pi of the largest, so a motor at its limit gives 1.6."""
+
+NEAR_LIMIT = 0.02
+"""Share of a joint's range within which it is at its limit: two steps of 1 %."""
+
+AGAIN = 3
+"""Times that a joint stands at one end of its motion, which is no chance: twice is one in four."""
+
+
+def standing_kinds(
+    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion]
+) -> tuple[tuple[str, ...], str]:
+    """Return the kinds that fit a joint that stands still, and what decides.
+
+    Args:
+        spans: When it stands [s].
+        like: Joints that its effort is compared with, if its own at other times can't be.
+    """
+    inside = within(motion.position.t_s, spans)
+    at_limit = ("at_limit",) if _at_limit(motion, inside, spans) else ()
+    kinds = ["jammed", "dead", "frozen_sensor"]
+    if not _repeats(motion.position, inside):
+        kinds.remove("frozen_sensor")  # new noise in each sample: the sensor measures
+    second = _moves(motion.reference, motion.command, spans)
+    if second:
+        return ("frozen_sensor",), "the second sensor moves"
+    if second is False:
+        kinds = [kind for kind in kinds if kind != "frozen_sensor"]
+    velocity = _moves(motion.velocity, motion.command, spans, rate=True)
+    if velocity and "frozen_sensor" in kinds:
+        if "velocity" in motion.outside_loop:
+            return ("frozen_sensor",), "the velocity goes on"
+        kinds = ["frozen_sensor", "dead"]  # as of a motor that turns on behind a broken gear
+    size = _effort(motion, spans, like)
+    if size is None:
+        return (*at_limit, *kinds), ""
+    if size < POWERLESS:
+        return (*at_limit, "dead"), f"its effort is {100 * size:.0f} % of the usual one"
+    driven = [kind for kind in kinds if kind != "dead"]
+    why = f"its effort is {size:.1f} times the usual one"
+    if "effort" in motion.outside_loop:
+        driven = ["jammed"] if size > PUSHES or "frozen_sensor" not in driven else ["frozen_sensor"]
+    return (*at_limit, *(driven or kinds)), why
+
+
+def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
+    """Return the kinds that fit a joint that moves against its command, and what decides."""
+    t_s, position = motion.position.t_s, motion.position.values
+    if motion.reference is not None and motion.reference.t_s.size > AGAIN:
+        along = _correlation(motion.reference.at(t_s), position)
+        if abs(along) > RESPONDS:
+            return (
+                (("inverted_sensor",), "the second sensor moves with the command")
+                if along < 0
+                else (("inverted",), "the second sensor moves against the command, too")
+            )
+    if motion.velocity is not None and motion.velocity.t_s.size > AGAIN:
+        rate = np.gradient(position, t_s)
+        if _correlation(motion.velocity.at(t_s), rate) < -RESPONDS:
+            return ("inverted_sensor",), "its velocity has the opposite sign of its position"
+    return ("inverted", "inverted_sensor"), ""
+
+
+def shifted_kinds(motion: JointMotion, from_s: float) -> tuple[tuple[str, ...], str]:
+    """Return the kinds that fit a zero that moved, and what decides."""
+    if motion.reference is None or motion.reference.t_s.size <= AGAIN:
+        return ("slipped", "slipped_sensor"), ""
+    t_s = motion.position.t_s
+    after = t_s >= from_s
+    gap = motion.position.values - motion.reference.at(t_s)
+    whole = motion.position.values - motion.command.at(t_s)
+    if not after.any() or after.all():
+        return ("slipped", "slipped_sensor"), ""
+    steps = [abs(np.median(v[after]) - np.median(v[~after])) for v in (gap, whole)]
+    if steps[0] > steps[1] / 2:
+        return ("slipped_sensor",), "the second sensor does not show it"
+    return ("slipped",), "the second sensor shows it, too"
+
+
+def within(t_s: FloatArray, spans: Sequence[Span]) -> BoolArray:
+    """Mark the times, increasing, that lie in any span."""
+    marked = np.zeros(t_s.size, dtype=np.bool_)
+    for start, stop in spans:
+        first, last = np.searchsorted(t_s, (start, stop))
+        marked[first:last] = True
+    return marked
+
+
+def _repeats(samples: Samples, inside: BoolArray) -> bool:
+    """Return whether most positions are, to the bit, the one before."""
+    values = samples.values[inside]
+    return values.size < 2 or 2 * int(np.count_nonzero(np.diff(values) == 0)) > values.size - 1
+
+
+def _moves(
+    samples: Samples | None, command: Samples, spans: Sequence[Span], *, rate: bool = False
+) -> bool | None:
+    """Return whether another quantity moves as commanded; None where it wasn't recorded."""
+    if samples is None:
+        return None
+    inside = within(samples.t_s, spans)
+    if np.count_nonzero(inside) <= AGAIN:
+        return None
+    t_s, values = samples.t_s[inside], samples.values[inside]
+    asked = command.at(t_s)
+    asked = np.gradient(asked, t_s) if rate else asked
+    size = float(np.std(asked))
+    return bool(size > 0 and np.std(values) > RESPONDS * size) if size > 0 else None
+
+
+def _effort(
+    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion]
+) -> float | None:
+    """Return the mean size of the effort while a joint stands, in the usual one.
+
+    The usual one is that of the joints like it at the same times; of fewer than three, its own at
+    other times.
+    """
+    here = _size(motion.effort, spans, inside=True)
+    if here is None:
+        return None
+    others = [_size(other.effort, spans, inside=True) for other in like if other is not motion]
+    known = [size for size in others if size is not None]
+    usual = float(np.median(known)) if len(known) >= AGAIN else None
+    if usual is None:
+        usual = _size(motion.effort, spans, inside=False)
+    return here / usual if usual else None
+
+
+def _size(effort: Samples | None, spans: Sequence[Span], *, inside: bool) -> float | None:
+    if effort is None:
+        return None
+    chosen = within(effort.t_s, spans)
+    values = effort.values[chosen if inside else ~chosen]
+    return float(np.mean(np.abs(values))) if values.size > AGAIN else None
+
+
+def _at_limit(motion: JointMotion, inside: BoolArray, spans: Sequence[Span]) -> bool:
+    """Return whether a joint stands at a limit, or again and again at one end of its motion."""
+    values = motion.position.values
+    if not inside.any():
+        return False
+    level = float(np.median(values[inside]))
+    if motion.limits is not None:
+        lower, upper = motion.limits
+        slack = NEAR_LIMIT * (upper - lower)
+        if level <= lower + slack or level >= upper - slack:
+            return True
+    levels = [values[within(motion.position.t_s, [span])] for span in spans]
+    medians = [float(np.median(level)) for level in levels if level.size]
+    slack = 2 * NEAR_LIMIT * motion.position.range
+    low, high = float(values.min()), float(values.max())
+    return len(medians) >= AGAIN and (max(medians) <= low + slack or min(medians) >= high - slack)
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> float:
+    if np.ptp(first) == 0 or np.ptp(second) == 0:
+        return 0.0
+    return float(np.corrcoef(first, second)[0, 1])
