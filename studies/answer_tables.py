@@ -21,8 +21,8 @@ from scipy.stats import norm
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.segments.examine import Chain, examine
-from undulog.capture.following.find import joints_not_following
-from undulog.capture.following.motion import JointMotion, Samples
+from undulog.capture.judgement.judge import judge
+from undulog.capture.judgement.motion import JointMotion, Samples
 
 GAIN, LAG = 0.95, np.radians(10.0)
 JOINTS = 9
@@ -155,7 +155,7 @@ def stated(recorded):
         JointMotion(name, Samples(t_s, asked), Samples(t_s, moved))
         for name, asked, moved in zip(joints, command, position, strict=True)
     ]
-    broken = tuple(fault.joint for fault in joints_not_following(motions))
+    broken = tuple(fault.joint for fault in judge(motions).faults)
     series = [
         {name: Series(name, t_s, row) for name, row in zip(joints, rows, strict=True)}
         for rows in (command, position)

@@ -18,6 +18,7 @@ from scipy.linalg import helmert
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
 from undulog.capture.common.errors import UsageError
+from undulog.capture.judgement.fault import Judgement
 from undulog.capture.robot.model import Robot
 
 from ..response.response import Response
@@ -213,9 +214,18 @@ def pooled_answer(
             commanded=tuple(commanded),
             not_following=tuple(sorted(faulty.values(), key=lambda each: order[each.joint])),
             findings=examine(chains),
+            judgement=_first_of_each_joint([session.answer for session in sessions]),
             warnings=first.warnings,
         )
     )
+
+
+def _first_of_each_joint(answers: Sequence[Answer]) -> Judgement:
+    """Return what the judgements of several sessions found, once a joint."""
+    changes = {change.joint: change for answer in answers[::-1] for change in answer.changes}
+    extra = {motion.joint: motion for answer in answers[::-1] for motion in answer.extra}
+    rests = {rest.joint: rest for answer in answers[::-1] for rest in answer.rests}
+    return Judgement((), tuple(changes.values()), tuple(extra.values()), tuple(rests.values()))
 
 
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:

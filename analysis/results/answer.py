@@ -16,6 +16,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from undulog.capture.judgement.fault import Change, ExtraMotion, RestsOff
+
 _MOST = 12
 """Digits after which two numbers are taken for equal."""
 
@@ -156,7 +158,7 @@ class NotFollowing:
 
     Attributes:
         kinds: Kinds of fault that fit and that the data can't separate: keys of
-            :data:`.capture.following.fault.KINDS`.
+            :data:`.capture.judgement.fault.KINDS`.
         since_s: From the session's start [s]; None where it holds from the beginning.
         until_s: Its end [s]; None where it holds to the end.
         share: Share of the session in which it holds, 0 to 1.
@@ -225,6 +227,9 @@ class Answer:
         sentence: One to three sentences; plain text, intervals in square brackets.
         detail: What qualifies it, one or two sentences.
         not_following: Joints that do not follow their command, in chain order.
+        changes: Changes of joints that follow, during the session.
+        extra: Motion at frequencies that aren't the commands'.
+        rests: Joints that rest off their command.
         stand_out: Joints that stand out, worst first.
         undecided: Why it can't be decided which joint differs, or None.
         shape: Shapes of the rest, those that explain most first; each simultaneous interval
@@ -236,6 +241,9 @@ class Answer:
     sentence: str = ""
     detail: str = ""
     not_following: tuple[NotFollowing, ...] = ()
+    changes: tuple[Change, ...] = ()
+    extra: tuple[ExtraMotion, ...] = ()
+    rests: tuple[RestsOff, ...] = ()
     stand_out: tuple[StandOut, ...] = ()
     undecided: str | None = None
     shape: tuple[Shape, ...] = ()

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
+from undulog.capture.judgement.fault import NOTHING, Change, ExtraMotion, Judgement, RestsOff
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
@@ -52,6 +53,7 @@ class Facts:
         commanded: Names of the joints whose command moves.
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
+        judgement: How the joints follow their commands.
         warnings: Of the analysis: they hold the reason where there is no answer.
         frequency_response: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
@@ -67,6 +69,7 @@ class Facts:
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
     left_out: str = ""
     motion: FreeMotion | None = None
+    judgement: Judgement = NOTHING
 
 
 def compose(facts: Facts) -> Answer:
@@ -79,7 +82,8 @@ def compose(facts: Facts) -> Answer:
         verdict = Verdict.UNLIKE
         detail = _responding(facts, known) + _caveat(facts.joints)
     findings = facts.findings
-    alike = False if first or findings.shape or findings.undecided else None
+    differs = first or findings.shape or findings.undecided
+    alike = False if differs else None
     if verdict is Verdict.ALIKE and facts.commanded and _everyone(facts):
         alike = True
     return Answer(
@@ -87,6 +91,9 @@ def compose(facts: Facts) -> Answer:
         sentence=" ".join(part for part in (first, rest, _left_out(facts), broken) if part),
         detail=detail,
         not_following=facts.not_following,
+        changes=facts.judgement.changes,
+        extra=facts.judgement.extra,
+        rests=facts.judgement.rests,
         stand_out=findings.stand_out,
         undecided=_undecided(facts) or None,
         shape=findings.shape,
@@ -120,7 +127,7 @@ def kinds_in_words(kinds: Sequence[str]) -> str:
     """Kinds of fault that fit, as a reader takes them.
 
     Args:
-        kinds: Keys of :data:`.capture.following.fault.KINDS`.
+        kinds: Keys of :data:`.capture.judgement.fault.KINDS`.
 
     Returns:
         For example ``jammed, dead or a frozen sensor``.
@@ -156,8 +163,15 @@ def _named(facts: Facts) -> str:
     if len(facts.not_following) > NAMED:
         names = [plain(each.joint) for each in facts.not_following[NAMED:]]
         clauses.append(f"{', '.join(names)} do not follow either")
+    if facts.judgement.naming:
+        clauses.insert(0, plain(facts.judgement.naming))
+    differences = (*facts.judgement.changes, *facts.judgement.extra, *facts.judgement.rests)
+    clauses += [_difference(difference) for difference in differences[:NAMED]]
+    changed = {change.joint for change in facts.judgement.changes}
     by_joint: dict[str, list[StandOut]] = {}
     for each in facts.findings.stand_out:
+        if each.joint in changed:  # what the mean of before and after shows
+            continue
         by_joint.setdefault(each.joint, []).append(each)
     for joint, several in list(by_joint.items())[:NAMED]:
         sizes = " and ".join(deviation_in_words(each) for each in several)
@@ -169,6 +183,12 @@ def _named(facts: Facts) -> str:
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
     return f"{'; '.join(clauses)}." if clauses else ""
+
+
+def _difference(difference: Change | ExtraMotion | RestsOff) -> str:
+    """A difference of one joint, as a clause."""
+    colon = ":" if isinstance(difference, Change) else ""
+    return f"{plain(difference.joint)}{colon} {difference.text}"
 
 
 def _left_out(facts: Facts) -> str:
@@ -213,7 +233,9 @@ def _size_in_words(quantity: str, value: float, ci95: Interval) -> str:
 
 def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
     """Verdict, sentence and detail on the joints that are not named."""
-    named = bool(facts.not_following or facts.findings.stand_out or facts.findings.undecided)
+    judged = facts.judgement
+    named = bool(facts.not_following or judged.changes or judged.extra or judged.rests)
+    named |= bool(facts.findings.stand_out or facts.findings.undecided)
     if facts.motion is not None or facts.gait.frequency_hz.value is None:
         about = "no command" if facts.motion is not None else "no gait"
         return Verdict.NOTHING, _without_gait(facts), _why_not(facts, about)

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
 from undulog.capture.common.extras import base_versions
-from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
@@ -168,10 +167,7 @@ def measure_session(
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
-    # A frame of made times repeats what is sampled more slowly.
-    faulty = (
-        () if times_made(session) else not_following(follows, held, columns.names, whole.duration_s)
-    )
+    faulty = not_following(follows)
     # Plateaus of stopped joints are no dead bands.
     moving = {name: one for name, one in sound.items() if name not in stopped(faulty)}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
@@ -253,6 +249,7 @@ def measure_session(
         frequency_response=swept,
         left_out=left_out,
         motion=analysis.free_motion,
+        judgement=follows.judgement,
     )
     analysis = dataclasses.replace(analysis, answer=led(compose(facts), warn.leading))
     return SessionMeasurement(

@@ -25,7 +25,9 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
-from undulog.capture.following.motion import JointMotion, Samples, linearised
+from undulog.capture.judgement.exposure import COHERENT
+from undulog.capture.judgement.motion import JointMotion, Samples, course_of, cycle_s
+from undulog.capture.judgement.response import Filtered, fit_response
 from undulog.capture.log.read.sample_times import LARGEST, Signal
 
 from ..estimators.series import Series, clean_together
@@ -371,8 +373,15 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
 def _linear(position: Series, command: Series) -> Series:
     """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
     asked, moved = (Samples(one.t_s, one.values) for one in (command, position))
-    own = linearised(JointMotion(command.name, asked, moved)).command
-    return command if own.t_s is command.t_s else Series(command.name, own.t_s, own.values)
+    course = course_of([JointMotion(command.name, asked, moved)])
+    if course is None or np.isfinite(cycle_s(course.command[0], course.step_s)):
+        return command
+    row = course.command[0], course.position[0], course.present[0], course.step_s
+    response = fit_response(*row)
+    if response.explained < COHERENT:
+        return command
+    output = Filtered(course.command, course.step_s).output(response)[0]
+    return Series(command.name, course.t_s, abs(response.gain) * output)
 
 
 def _of_scale(

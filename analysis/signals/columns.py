@@ -12,7 +12,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.following.find import MOST_JOINTS
+from undulog.capture.judgement.session import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
 from undulog.capture.log.read.pauses import without_pauses

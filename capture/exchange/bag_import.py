@@ -22,7 +22,7 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, ImportFormatError, MissingChannelError, some_names
 from ..common.files import check_stop
 from ..common.process import StopRequest
-from ..following.find import MOST_JOINTS
+from ..judgement.session import MOST_JOINTS
 from ..log.cut import cut_log
 from ..log.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag

@@ -76,6 +76,7 @@ class _Run:
     """A run of blocks ``first`` to ``last`` (exclusive) and how it differs from the others."""
 
     change: float
+    outside: float  # mean of the others
     error: float
     first: int
     last: int
@@ -122,12 +123,12 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
 
 def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
     """Turn a run of blocks into a change; one that begins the record is undone at its end."""
-    change, first, last = run.change, run.first, run.last
+    change, before, first, last = run.change, run.outside, run.first, run.last
     count = edges_s.size - 1
     if first == 0:
-        change, first, last = -change, last, count
-        if quantity == "gain":
-            change = change / (1 - change)
+        change, before, first, last = -change, before + change, last, count
+    if quantity == "gain":
+        change /= 1 + before
     return Jump(
         k,
         quantity,
@@ -223,7 +224,8 @@ def _regressed(
     moments = np.moveaxis(np.add.reduceat(products, starts, axis=2), 2, 0)
     gram, target = moments[:, :3, :3], moments[:, :3, 3]
     count = gram[:, 0, 0]
-    scale = np.sqrt(np.maximum(np.median(np.diagonal(gram, axis1=1, axis2=2), axis=0), 1e-30))
+    typical = np.median(np.diagonal(gram, axis1=1, axis2=2), axis=0)
+    scale = np.sqrt(np.where(typical > 0, typical, 1.0))
     scaled = gram / scale[:, None] / scale[None, :]
     # A block without motion knows its offset only: the ridge keeps the rest at 0, weightless.
     ridge = np.diag([0.0, RIDGE, RIDGE])
@@ -312,7 +314,7 @@ def _largest(values: FloatArray, weights: FloatArray, inflation: float, tests: i
         first, last = _runs(known.size, lasting=lasting)
         if not first.size:
             continue
-        change, error = _tested(v, w, first, last, inflation)
+        change, inside, error = _tested(v, w, first, last, inflation)
         freedom = max((known.size - 2) / inflation, 1.0)
         limit = -float(stdtrit(freedom, LEVEL / 4 / tests / first.size))
         t = np.abs(change) / error
@@ -322,7 +324,9 @@ def _largest(values: FloatArray, weights: FloatArray, inflation: float, tests: i
             stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
             inner = float(w[first[k] : last[k]].sum())
             drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
-            best = t[k] / limit, _Run(float(change[k]), float(error[k]), start, stop, drop)
+            outside = (float(w @ v) - inner * float(inside[k])) / (float(w.sum()) - inner)
+            run = _Run(float(change[k]), outside, float(error[k]), start, stop, drop)
+            best = t[k] / limit, run
     return None if best is None else best[1]
 
 
@@ -341,8 +345,8 @@ def _runs(count: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
 
 def _tested(
     v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, inflation: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return change and standard error of runs."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return change, mean inside, and standard error of the change of runs."""
     sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
     inside = sums[:, last] - sums[:, first]
     outside = sums[:, -1:] - inside
@@ -350,4 +354,4 @@ def _tested(
     change = vi / wi - vo / wo
     squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
     variance = squares / max(v.size - 2, 1) * inflation * (1 / wi + 1 / wo)
-    return change, np.sqrt(np.maximum(variance, 1e-300))
+    return change, vi / wi, np.sqrt(np.maximum(variance, 1e-300))

@@ -88,8 +88,8 @@ def exposure_of(
     rest = np.empty(len(motions))
     for k, response in enumerate(responses):
         group = [j for j, number in enumerate(like) if number == like[k]]
-        sound = [responses[j] for j in group if _responds(responses[j])]
-        common = _median_response(sound) if len(group) >= ENOUGH_LIKE and sound else Response(1.0)
+        sound = [responses[j] for j in group if responds(responses[j])]
+        common = median_response(sound) if len(group) >= ENOUGH_LIKE and sound else Response(1.0)
         offset = response.offset_rad
         healthy[k] = offset + common.gain * filtered[k].output(common)[0]
         others = [j for j in range(len(motions)) if j != k]
@@ -98,7 +98,7 @@ def exposure_of(
         else:  # of joints unlike each other the worst may be the one that is like it
             pooled = float(np.max(lost[others])) if others else float(LARGEST_REST_RAD)
         rest[k] = min(pooled, float(LARGEST_REST_RAD))
-        known = sound or [r for r in responses if _responds(r)]
+        known = sound or [r for r in responses if responds(r)]
         settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
     own = np.minimum(lost, LARGEST_REST_RAD)
     least = np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own)
@@ -106,7 +106,8 @@ def exposure_of(
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
 
 
-def _responds(response: Response) -> bool:
+def responds(response: Response) -> bool:
+    """Return whether a joint responds to its command, the right way round."""
     return response.gain >= RESPONDS and response.explained >= COHERENT
 
 
@@ -116,17 +117,17 @@ def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tupl
     if all(kind is not None for kind in kinds):
         names = list(dict.fromkeys(kinds))
         return tuple(names.index(kind) for kind in kinds)
-    sound = [response for response in responses if _responds(response)]
+    sound = [response for response in responses if responds(response)]
     if len(sound) < ENOUGH_LIKE or 3 * len(sound) < 2 * len(responses):
         return tuple(range(len(motions)))
-    common = _median_response(sound)
-    agree = [_agrees(response, common) for response in responses]
+    common = median_response(sound)
+    agree = [agrees(response, common) for response in responses]
     if sum(agree) < max(ENOUGH_LIKE, 2 * len(responses) / 3):
         return tuple(range(len(motions)))
     return (0,) * len(motions)
 
 
-def _agrees(response: Response, common: Response) -> bool:
+def agrees(response: Response, common: Response) -> bool:
     """Return whether a response is a common one, up to a profile along the body."""
     return abs(response.gain / common.gain - 1) < RESPONDS and (
         abs(response.lag_s - common.lag_s) < max(RESPONDS * common.lag_s, LIKE_LAG_S)
@@ -138,7 +139,7 @@ LIKE_LAG_S = 0.05
 (40 Hz)."""
 
 
-def _median_response(responses: Sequence[Response]) -> Response:
+def median_response(responses: Sequence[Response]) -> Response:
     """Return the response of the joint of median lag, with the median gain."""
     lags = np.array([response.lag_s for response in responses])
     middle = responses[int(np.argsort(lags)[(lags.size - 1) // 2])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 Span = tuple[float, float]
@@ -26,7 +27,6 @@ KINDS: dict[str, tuple[str, str]] = {
     "drifting_sensor": ("sensor", "the sensor's zero drifts"),
     "clipped_sensor": ("sensor", "the sensor's range ends before the motion"),
     "lost_samples": ("record", "samples of the joint are missing"),
-    "unknown": ("unknown", "something changed"),
 }
 """Kind of fault to where it lies and what it is."""
 
@@ -80,6 +80,25 @@ class Change:
     until_s: float | None
     onset_s: Span
 
+    @property
+    def text(self) -> str:
+        """What changed, e.g. ``from 16.5 s on gain 40 % less``."""
+        end = "on" if self.until_s is None else f"to {self.until_s:.1f} s"
+        return f"from {self.from_s:.1f} s {end} {_size(self.quantity, self.change)}"
+
+
+def _size(quantity: str, change: float) -> str:
+    match quantity:
+        case "gain":
+            return f"gain {100 * abs(change):.2g} % {'less' if change < 0 else 'more'}"
+        case "lag":
+            return f"{1e3 * abs(change):.2g} ms {'earlier' if change < 0 else 'later'}"
+        case "offset":
+            place = "below" if change < 0 else "above"
+            return f"its mean {abs(math.degrees(change)):.2g} degrees {place} what it was"
+        case _:
+            return f"noise {change:.2g} times as large"
+
 
 @dataclass(frozen=True)
 class ExtraMotion:
@@ -93,6 +112,12 @@ class ExtraMotion:
     joint: str
     frequency_hz: float
     amplitude_rad: float
+
+    @property
+    def text(self) -> str:
+        """E.g. ``also moves at 6.1 Hz, by 11 degrees``."""
+        size = f"{math.degrees(self.amplitude_rad):.2g} degrees"
+        return f"also moves at {self.frequency_hz:.3g} Hz, by {size}"
 
 
 @dataclass(frozen=True)
@@ -110,6 +135,11 @@ class RestsOff:
     range_rad: tuple[float, float]
     rests: int
 
+    @property
+    def text(self) -> str:
+        """E.g. ``rests up to 4.2 degrees off its command``."""
+        return f"rests up to {abs(math.degrees(self.offset_rad)):.2g} degrees off its command"
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -123,6 +153,7 @@ class Judgement:
         unexposed: Joints that were not asked to move enough to judge, with the largest motion that
             was asked of them [rad].
         judged: Joints that were.
+        naming: What may be wrong with the joints' names, a clause; empty if nothing is.
     """
 
     faults: tuple[Fault, ...] = ()
@@ -131,3 +162,8 @@ class Judgement:
     rests: tuple[RestsOff, ...] = ()
     unexposed: tuple[tuple[str, float], ...] = ()
     judged: tuple[str, ...] = ()
+    naming: str = ""
+
+
+NOTHING = Judgement()
+"""Of a session that can't be judged."""

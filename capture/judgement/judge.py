@@ -16,10 +16,20 @@ import numpy as np
 from ..common.arrays import BoolArray, merged_ranges
 from ..common.process import in_threads
 from .changes import Jump, find_jumps
-from .exposure import COHERENT, RESPONDS, REST_ERRORS, Exposure, exposure_of
+from .exposure import (
+    COHERENT,
+    RESPONDS,
+    REST_ERRORS,
+    Exposure,
+    agrees,
+    exposure_of,
+    median_response,
+    responds,
+)
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .lines import find_lines
 from .motion import Course, JointMotion, course_of
+from .naming import Verdict, in_words, permutation_of
 from .record import record_faults
 from .response import BLOCKS, Response, fit_response
 from .rests import find_rests
@@ -64,6 +74,8 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     exposure = exposure_of(course, driven, responses)
     stillness = stillness_of(course, exposure)
     faults = _faults(course, driven, exposure, stillness)
+    names_clause, swapped = _naming(course, driven, exposure)
+    faults |= swapped
     for name, fault in record.items():
         # Missing samples are no reason for anything else; a counter's turns and old values are.
         if name not in faults or "lost_samples" not in fault.kinds:
@@ -91,6 +103,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
             if not exposed[k]
         ),
         judged=tuple(name for k, name in enumerate(names) if exposed[k]),
+        naming=names_clause,
     )
 
 
@@ -116,7 +129,7 @@ def _faults(
             continue
         like = [driven[j] for j in exposure.group(k)]
         others = np.delete(explained, k)
-        stands = stillness.stands[k] & ~common
+        stands = _alone(stillness.stands[k], common)
         share = float(stands.sum()) / max(int(stillness.exposed[k].sum()), 1)
         if response.gain < -RESPONDS and response.explained > COHERENT:
             kinds, why = opposite_kinds(motion)
@@ -139,12 +152,49 @@ def _faults(
     return faults
 
 
+def _naming(
+    course: Course, driven: Sequence[JointMotion], exposure: Exposure
+) -> tuple[str, dict[str, Fault]]:
+    """Ask whether a permutation of the names explains more, where a joint is unlike the others."""
+    sound = [r for r in exposure.responses if responds(r)]
+    odd = len(sound) < len(driven) or not all(agrees(r, median_response(sound)) for r in sound)
+    if len(driven) < 2 or not odd:
+        return "", {}
+    naming = permutation_of(course.command.T, course.position.T, course.step_s)
+    names = [motion.name for motion in driven]
+    if naming.verdict is Verdict.EITHER:
+        return in_words(naming, names), {}
+    if naming.verdict is not Verdict.PERMUTED or naming.permutation is None:
+        return "", {}
+    swapped = {
+        names[k]: _whole(driven[k], ("swapped",), f"carries out the command of {names[j]}")
+        for k, j in enumerate(naming.permutation)
+        if k != j
+    }
+    return in_words(naming, names), swapped
+
+
 def _common_stands(stillness: Stillness) -> BoolArray:
     """Mark the steps at which most joints that have to move stand: no fault of one of them."""
     exposed, stands = stillness.exposed.sum(axis=0), stillness.stands.sum(axis=0)
     common = (2 * stands > exposed) & (stands > 2)
     # Throughout it is none: no joint follows.
     return common if common.sum() < WHOLE * np.count_nonzero(exposed) else np.zeros_like(common)
+
+
+def _alone(stands: BoolArray, common: BoolArray) -> BoolArray:
+    """Leave out the times at which a joint stands for most of which most joints do."""
+    result = stands.copy()
+    for first, last in runs_of(stands):
+        if 2 * int(common[first:last].sum()) > last - first:
+            result[first:last] = False
+    return result
+
+
+def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
+    """Return the first index and the one after the last of each run of marks."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _unit_factor(k: int, exposure: Exposure) -> str | None:
@@ -160,9 +210,9 @@ def _unit_factor(k: int, exposure: Exposure) -> str | None:
 
 def _spans(marked: BoolArray, course: Course) -> tuple[Span, ...]:
     """Return the marked steps as time spans [s]; gaps of a few steps are closed."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
-    times = course.t_s[0] + course.step_s * edges.reshape(-1, 2)
-    return tuple(merged_ranges([(float(a), float(b)) for a, b in times], BLOCKS * course.step_s))
+    start, step = float(course.t_s[0]), course.step_s
+    spans = [(start + step * first, start + step * last) for first, last in runs_of(marked)]
+    return tuple(merged_ranges(spans, BLOCKS * step))
 
 
 def _trimmed(span: Span, course: Course, k: int, exposure: Exposure) -> Span:
@@ -180,7 +230,8 @@ def _stood(spans: Sequence[Span], course: Course, k: int, exposure: Exposure) ->
     inside = (course.t_s >= start) & (course.t_s < stop)
     moved = np.degrees(np.ptp(course.position[k, inside]))
     asked = np.degrees(np.ptp(exposure.healthy[k, inside]))
-    return f"moves {moved:.1f} of {asked:.1f} degrees in {stop - start:.1f} s"
+    size = f"{moved:.1f} of {asked:.1f} degrees in {stop - start:.1f} s"
+    return f"stands still while its command moves, {size}"
 
 
 def _whole(motion: JointMotion, kinds: tuple[str, ...], evidence: str) -> Fault:

@@ -50,14 +50,18 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     Args:
         usable: Steps that are looked at, shape (k, n); elsewhere the residual counts as zero.
     """
-    count, size = course.position.shape
-    frequency = np.asarray(np.fft.rfftfreq(size, course.step_s), dtype=np.float64)
-    residual = np.where(usable, course.position - exposure.fitted, 0.0)
+    begun = int(np.median(np.argmax(usable, axis=1)))
+    usable = usable[:, begun:]
+    count, size = usable.shape
+    # Between the frequencies of the record a line would lose up to a third of its amplitude.
+    padded = 2 << size.bit_length()
+    frequency = np.asarray(np.fft.rfftfreq(padded, course.step_s), dtype=np.float64)
+    residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
     amplitude, tail = np.empty((2, count, frequency.size))
     for k in range(count):
-        amplitude[k], tail[k] = _tested(residual[k])
-    tests = count * frequency.size
+        amplitude[k], tail[k] = _tested(residual[k], padded)
+    tests = count * size
     lines: list[Line] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
@@ -91,16 +95,16 @@ def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolA
     return np.asarray(free, dtype=np.bool_)
 
 
-def _tested(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray]:
     """Return amplitude of a line and chance of it without one, at each frequency."""
     size = residual.size
     steps = np.arange(1, size + 1)
-    power, projected = np.zeros((2, size // 2 + 1))
-    weighted = np.zeros(size // 2 + 1, dtype=np.complex128)
+    power = np.zeros(padded // 2 + 1)
+    weighted = np.zeros(padded // 2 + 1, dtype=np.complex128)
     sums = 0.0
     for k in range(1, TAPERS + 1):
         taper = (2 / (size + 1)) ** 0.5 * np.sin(np.pi * k * steps / (size + 1))
-        transformed: ComplexArray = np.fft.rfft(taper * residual)
+        transformed: ComplexArray = np.fft.rfft(taper * residual, padded)
         total = float(taper.sum())
         weighted += total * transformed
         power += np.abs(transformed) ** 2

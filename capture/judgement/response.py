@@ -14,6 +14,7 @@ concentration steps (Rousseeuw & Van Driessen, Data Min. Knowl. Disc. 12, 2006, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,11 +46,17 @@ DAMPINGS = (1.0, 0.5)
 SETTLED = 5
 """Time constants after which a pole has settled, to exp(-5) = 0.7 %."""
 
+FIT_STEP_S = 0.02
+"""Steps of the fit [s], or the course's where they are longer: ten samples of a period at 5 Hz."""
+
 FIT_STEPS = 8192
 """Steps that are fitted; of a longer course eight parts of a thousand, evenly spread."""
 
 PARTS = 8
 """Of a course that is longer than :data:`FIT_STEPS`."""
+
+BY_TIME = 0.01
+"""Share of a block's travel that time alone makes: blocks don't all end where a command rests."""
 
 STEPS_OF_C = 4
 """Concentration steps: they converge in three to five (2006, section 3)."""
@@ -83,6 +90,11 @@ class Response:
         return self.delay_s + self.constant_s * (0, 1, 2 * self.damping)[self.order]
 
 
+USUAL = Response(constant_s=0.1, order=1)
+"""What a servo of a bandwidth of 1.6 Hz makes of a command: what is faster hardly moves it, and
+doesn't make blocks."""
+
+
 class Filtered:
     """A command that delays and poles are applied to."""
 
@@ -93,25 +105,34 @@ class Filtered:
             command: Parts of a command, shape (p, n).
             step_s: [s].
         """
-        memory = int(np.ceil((LATEST_S + SETTLED * SLOWEST_S) / step_s)) + 1
         self._steps = command.shape[1]
-        self._pad = memory
-        size = 1 << int(np.ceil(np.log2(self._steps + 2 * memory)))
-        after = size - self._steps - memory
-        self._size = size
-        self._spectrum = np.fft.rfft(np.pad(command, ((0, 0), (memory, after)), mode="edge"))
-        self._turn = 2j * np.pi * np.fft.rfftfreq(size, step_s)
+        self._pad = int(np.ceil((LATEST_S + SETTLED * SLOWEST_S) / step_s)) + 1
+        self._size = _fast_size(self._steps + 2 * self._pad)
+        after = self._size - self._steps - self._pad
+        self._spectrum = np.fft.rfft(np.pad(command, ((0, 0), (self._pad, after)), mode="edge"))
+        self._turn = 2j * np.pi * np.fft.rfftfreq(self._size, step_s)
 
     def output(self, response: Response) -> FloatArray:
         """Return x of equation (1), shape (p, n)."""
-        factor = np.exp(-self._turn * response.delay_s)
-        turn = self._turn * response.constant_s
-        if response.order == 1:
-            factor = factor / (1 + turn)
-        elif response.order == 2:
-            factor = factor / (1 + 2 * response.damping * turn + turn**2)
-        whole = np.fft.irfft(self._spectrum * factor, self._size)
-        return whole[:, self._pad : self._pad + self._steps]
+        return self.outputs([response])[0]
+
+    def outputs(self, responses: Sequence[Response]) -> FloatArray:
+        """Return x of equation (1) for r responses, shape (r, p, n)."""
+        delay = np.array([[r.delay_s] for r in responses])
+        first = np.array([[r.constant_s * (0, 1, 2 * r.damping)[r.order]] for r in responses])
+        second = np.array([[r.constant_s**2 if r.order == 2 else 0.0] for r in responses])
+        turn = self._turn[None, :]
+        factor = np.exp(-turn * delay)
+        if first.any():
+            factor /= 1 + turn * first + turn**2 * second
+        whole = np.fft.irfft(self._spectrum[None] * factor[:, None], self._size)
+        return np.asarray(whole[:, :, self._pad : self._pad + self._steps], dtype=np.float64)
+
+
+def _fast_size(least: int) -> int:
+    """Return the least size of the form 2^k or 5 * 2^k, which transform fast."""
+    power = 1 << (least - 1).bit_length()
+    return 5 * power // 8 if 5 * power // 8 >= least else power
 
 
 def fit_response(
@@ -128,27 +149,45 @@ def fit_response(
     Returns:
         The response; a gain of 0 where the command or the position doesn't move.
     """
-    parts = _parts(command.size)
-    c, y, there = command[parts], position[parts], present[parts].astype(np.float64)
-    trimmed = _Trimmed(c, y, there)
-    filtered = Filtered(c, step_s)
-    tried = [Response(delay_s=float(d)) for d in np.linspace(0, LATEST_S, DELAYS)]
-    constants = [SLOWEST_S / 2**k for k in range(CONSTANTS)]
-    tried += [Response(constant_s=constant, order=1) for constant in constants]
-    tried += [
-        Response(constant_s=constant / 2, order=2, damping=damping)
-        for constant in constants
-        for damping in DAMPINGS
-    ]
-    fits = [trimmed.fit(filtered.output(response), response) for response in tried]
-    best = [min((fits[k] for k in ks), key=_merit) for ks in _by_order(tried)]
+    stride = max(1, int(FIT_STEP_S / step_s))
+    parts = _parts(command[::stride].size)
+    c, y = command[::stride][parts], position[::stride][parts]
+    there = present[::stride][parts]
+    filtered = Filtered(c, stride * step_s)
+    trimmed = _Trimmed(filtered.output(USUAL), y, there.astype(np.float64))
+    best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids()]
     step = LATEST_S / (DELAYS - 1)
-    squares, response, _ = min((_refined(f, trimmed, filtered, step) for f in best), key=_merit)
+    for _ in range(ROUNDS):
+        step /= 2
+        moved = [_moved(response, step) for _, response, _ in best]
+        outputs = filtered.outputs([response for some in moved for response in some])
+        ends = np.cumsum([len(some) for some in moved])
+        for k, some in enumerate(moved):
+            part = outputs[ends[k] - len(some) : ends[k]]
+            best[k] = min(best[k], trimmed.best(part, some, best[k][2]), key=_merit)
+    squares, response, _ = min(best, key=_merit)
     return response if squares < trimmed.least_variance else replace(response, gain=0.0)
 
 
+def _grids() -> tuple[list[Response], ...]:
+    """Return the responses that the search begins with, by their order."""
+    delays = np.linspace(0, LATEST_S, DELAYS).tolist()
+    constants = [SLOWEST_S / 2**k for k in range(CONSTANTS)]
+    few = delays[:: DELAYS // 2]
+    return (
+        [Response(delay_s=delay) for delay in delays],
+        [Response(1.0, 0.0, delay, constant, 1) for delay in few for constant in constants],
+        [
+            Response(1.0, 0.0, delay, constant / 2, 2, damping)
+            for delay in few
+            for constant in constants
+            for damping in DAMPINGS
+        ],
+    )
+
+
 _Fit = tuple[float, Response, FloatArray]
-"""Trimmed squares, the response, and the blocks that were kept, shape (1, b)."""
+"""Trimmed squares, the response, and the blocks that were kept, shape (b,)."""
 
 
 def _merit(fit: _Fit) -> tuple[float, int, float]:
@@ -157,25 +196,16 @@ def _merit(fit: _Fit) -> tuple[float, int, float]:
     return squares, response.order, response.delay_s
 
 
-def _by_order(tried: list[Response]) -> list[list[int]]:
-    return [[k for k, response in enumerate(tried) if response.order == n] for n in range(3)]
-
-
-def _refined(start: _Fit, trimmed: _Trimmed, filtered: Filtered, step_s: float) -> _Fit:
-    """Halve the steps of delay and time constant about the best, again and again."""
-    best = start
-    for _ in range(ROUNDS):
-        step_s /= 2
-        _, centre, keep = best
-        constants = (-1, 0, 1) if centre.order else (0,)
-        for k in (-1, 0, 1):
-            for j in constants:
-                delay = min(max(centre.delay_s + k * step_s, 0.0), LATEST_S)
-                constant = min(max(centre.constant_s + j * step_s, 0.0), SLOWEST_S)
-                if k or j:
-                    moved = replace(centre, delay_s=delay, constant_s=constant)
-                    best = min(best, trimmed.fit(filtered.output(moved), moved, keep), key=_merit)
-    return best
+def _moved(centre: Response, step_s: float) -> list[Response]:
+    """Return the neighbours of a response, a step of delay or time constant away."""
+    found: list[Response] = []
+    for k in (-1, 0, 1):
+        for j in (-1, 0, 1) if centre.order else (0,):
+            delay = min(max(centre.delay_s + k * step_s, 0.0), LATEST_S)
+            constant = min(max(centre.constant_s + j * step_s, 0.0), SLOWEST_S)
+            if k or j:
+                found.append(replace(centre, delay_s=delay, constant_s=constant))
+    return found
 
 
 def _parts(size: int) -> IntArray:
@@ -190,18 +220,19 @@ def _parts(size: int) -> IntArray:
 class _Trimmed:
     """Least trimmed squares of one position over blocks."""
 
-    def __init__(self, command: FloatArray, position: FloatArray, weight: FloatArray) -> None:
-        travel = np.abs(np.diff(command, axis=1, prepend=command[:, :1])) * weight
+    def __init__(self, motion: FloatArray, position: FloatArray, weight: FloatArray) -> None:
+        travel = np.abs(np.diff(motion, axis=1, prepend=motion[:, :1])) * weight
         total = float(travel.sum())
-        # A hundredth by time alone: blocks don't end where a command rests.
-        share = np.cumsum((travel / total if total > 0 else 0.0) + 0.01 * weight / weight.sum())
-        targets = share[-1] * np.arange(BLOCKS, dtype=np.float64) / BLOCKS
-        edges: IntArray = np.searchsorted(share.ravel(), targets).astype(np.int64)
+        parts = (travel / total if total > 0 else 0.0) + BY_TIME * weight / weight.sum()
+        share: FloatArray = np.cumsum(parts.ravel())
+        targets: FloatArray = share[-1] * np.arange(BLOCKS, dtype=np.float64) / BLOCKS
+        edges = np.searchsorted(share, targets).astype(np.int64)
         self._edges: IntArray = np.unique(np.minimum(edges, share.size - 1))
         self._weight = weight.ravel()
         self._middle = float(np.median(position))
         self._y = (position - self._middle).ravel()
-        self._of_y = self._sums(self._weight, self._y, self._y**2)
+        rows = self._weight * np.stack([np.ones_like(self._y), self._y, self._y**2])
+        self._of_y = np.add.reduceat(rows, self._edges, axis=1)
         blocks = self._edges.size
         self._keep = max(1, int(np.ceil(blocks * 2 / 3)))
         third = blocks - self._keep
@@ -213,59 +244,62 @@ class _Trimmed:
         variances = np.sort(np.maximum(yy - y**2 / np.maximum(n, 1), 0))
         self.least_variance = float(variances[: self._keep].sum())
 
-    def _sums(self, *columns: FloatArray) -> FloatArray:
-        rows = np.stack([columns[0], *(self._weight * column for column in columns[1:])])
-        return np.add.reduceat(rows, self._edges, axis=1)
+    def best(
+        self, outputs: FloatArray, responses: Sequence[Response], keep: FloatArray | None = None
+    ) -> _Fit:
+        """Fit gain and offset of r responses, from all starts or from a neighbour's blocks.
 
-    def fit(self, output: FloatArray, response: Response, keep: FloatArray | None = None) -> _Fit:
-        """Fit gain and offset, from all starts or from the blocks of a neighbour's fit."""
-        middle = float(output.mean())
-        x = output.ravel() - middle
-        sums = self._sums(self._weight, x, x**2, x * self._y)
-        kept = self._starts if keep is None else keep
-        step = self._concentrated(sums, kept)
+        Args:
+            outputs: x of equation (1), shape (r, p, n).
+            responses: r.
+            keep: Blocks that a neighbour's fit has kept, shape (b,).
+
+        Returns:
+            The one with the least squares.
+        """
+        flat = outputs.reshape(len(responses), -1)
+        middle = flat.mean(axis=1)
+        x = flat - middle[:, None]
+        weighted = self._weight * x
+        sums = np.add.reduceat(
+            np.stack([weighted, weighted * x, weighted * self._y]), self._edges, axis=2
+        )
+        starts = self._starts if keep is None else keep[None, :]
+        kept = np.broadcast_to(starts, (len(responses), *starts.shape))
+        gain, offset, squares, kept = self._concentrated(sums, kept)
         for _ in range(STEPS_OF_C - 1 if keep is None else 0):
-            step = self._concentrated(sums, step.keep)
-        left = np.sum(step.keep * step.squares, axis=1)
-        k = int(np.argmin(left))
-        count, mean, square = (float(step.keep[k] @ column) for column in self._of_y)
-        variance = square - mean**2 / max(count, 1.0)
-        least = max(float(left[k]), 0.0)
-        gain = float(step.gain[k])
-        offset_rad = float(step.offset[k]) + self._middle - gain * middle
+            gain, offset, squares, kept = self._concentrated(sums, kept)
+        left = np.sum(kept * squares, axis=2)
+        r, k = (int(index) for index in np.unravel_index(np.argmin(left), left.shape))
+        least, chosen = max(float(left[r, k]), 0.0), kept[r, k]
+        count, mean, square = self._of_y @ chosen
+        variance = float(square - mean**2 / max(count, 1.0))
         explained = max(1 - least / variance, 0.0) if variance > 0 else 0.0
-        full = replace(response, gain=gain, offset_rad=offset_rad, explained=explained)
-        return least, full, step.keep[k : k + 1]
+        offset_rad = float(offset[r, k]) + self._middle - float(gain[r, k]) * float(middle[r])
+        full = replace(
+            responses[r], gain=float(gain[r, k]), offset_rad=offset_rad, explained=explained
+        )
+        return least, full, chosen
 
-    def _concentrated(self, sums: FloatArray, keep: FloatArray) -> _Step:
-        """Fit the kept blocks; return the blocks with the least squares of that fit."""
+    def _concentrated(
+        self, sums: FloatArray, keep: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Fit the kept blocks from s starts; return the blocks with the least squares of that fit.
+
+        Returns:
+            Gain and offset, shape (r, s), and the squares and kept blocks, shape (r, s, b).
+        """
         n, y, yy = self._of_y
-        _, sx, xx, xy = sums
-        count, mx, my, mxx, mxy = (keep @ np.stack([n, sx, y, xx, xy], axis=1)).T
+        sx, xx, xy = sums
+        count, my = keep @ n, keep @ y
+        mx, mxx, mxy = (np.einsum("rsb,rb->rs", keep, column) for column in (sx, xx, xy))
         spread = mxx - mx**2 / count
         moves = spread > 0
         gain = np.where(moves, (mxy - mx * my / count) / np.where(moves, spread, 1), 0)
         offset = (my - gain * mx) / count
-        g, b = gain[:, None], offset[:, None]
+        g, b = gain[..., None], offset[..., None]
+        sx, xx, xy = (column[:, None, :] for column in (sx, xx, xy))
         squares = yy - 2 * g * xy - 2 * b * y + g**2 * xx + 2 * g * b * sx + b**2 * n
-        least = np.argsort(squares, axis=1)[:, : self._keep]
-        chosen = np.zeros_like(squares)
-        np.put_along_axis(chosen, least, 1.0, axis=1)
-        return _Step(gain, offset, squares, chosen)
-
-
-@dataclass(frozen=True)
-class _Step:
-    """One concentration step from s starts over b blocks.
-
-    Attributes:
-        gain: Shape (s,).
-        offset: Shape (s,).
-        squares: Of each block, shape (s, b).
-        keep: Blocks with the least, shape (s, b).
-    """
-
-    gain: FloatArray
-    offset: FloatArray
-    squares: FloatArray
-    keep: FloatArray
+        limit = np.partition(squares, self._keep - 1, axis=2)[:, :, self._keep - 1]
+        kept = (squares <= limit[..., None]).astype(np.float64)
+        return gain, offset, squares, kept

@@ -54,7 +54,8 @@ def standing_kinds(
     if velocity and "frozen_sensor" in kinds:
         if "velocity" in motion.outside_loop:
             return ("frozen_sensor",), "the velocity goes on"
-        kinds = ["frozen_sensor", "dead"]  # as of a motor that turns on behind a broken gear
+        # A motor turns on behind a broken gear, too.
+        return (*at_limit, "frozen_sensor", "dead"), "its velocity goes on"
     size = _effort(motion, spans, like)
     if size is None:
         return (*at_limit, *kinds), ""

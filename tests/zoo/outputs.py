@@ -13,8 +13,8 @@ from undulog.analysis.session.analyse import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.following.find import joints_not_following
-from undulog.capture.following.motion import JointMotion, Samples
+from undulog.capture.judgement.judge import judge
+from undulog.capture.judgement.motion import JointMotion, Samples
 from undulog.capture.log.health.session_check import check_session
 from undulog.replay.draw.drawing import markdown
 from undulog.replay.samples.content import Content
@@ -128,7 +128,7 @@ def detected(log):
         )
         for j, name in enumerate(robot.names)
     ]
-    found = _named(joints_not_following(motions))
+    found = _named(judge(motions).faults)
     return Statement(" ".join(found), found)
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from ...following.fault import Fault as JointFault
+from ...judgement.fault import Fault as JointFault
+from ...judgement.fault import Judgement
 from ..columns.names import one_name_sentences
 from ..messages import COMMAND_TOPIC
 from ..messages.definitions import VERDICTS
@@ -403,6 +404,14 @@ def judge_following(fault: JointFault) -> Finding:
     when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
     when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
     return Finding(1, f"{fault.joint}{when} {fault.evidence}: {' or '.join(fault.kinds)}")
+
+
+def judge_differences(judgement: Judgement) -> Iterator[Finding]:
+    """Yield findings on joints that changed, or that move besides their command."""
+    for change in judgement.changes:
+        yield Finding(1, f"{change.joint}: {change.text}")
+    for extra in judgement.extra:
+        yield Finding(1, f"{extra.joint} {extra.text}")
 
 
 def judge_bus(health: BusHealth) -> Iterator[Finding]:

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from ...common.errors import DataError, LogError
 from ...common.process import threads_or_default
 from ...common.remote import as_path
-from ...following.find import faults_in_session
+from ...judgement.session import judgement_of_session
 from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
 from ..mcap.file import McapFile
@@ -31,7 +31,14 @@ from ..read.joint_messages import joint_source
 from ..read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
-from .rules import Finding, judge_file, judge_following, judge_made_times, verdict_of
+from .rules import (
+    Finding,
+    judge_differences,
+    judge_file,
+    judge_following,
+    judge_made_times,
+    verdict_of,
+)
 from .session_scan import SessionMeasures, SessionScan
 from .tallies import FileHealth
 
@@ -218,16 +225,16 @@ class _Check:
         if file.damage:
             return []
         try:
-            faults = faults_in_session(self._view)
+            judgement = judgement_of_session(self._view)
         except DataError as error:
             why = str(error).removeprefix(f"{self._file.path}: ")
             return [Finding(0, f"whether joints follow their command is not known: {why}")]
         return [
             judge_following(fault)
-            for fault in faults
+            for fault in judgement.faults
             if fault.kinds != ("lost_samples",)
             or not any(_names(one, fault.joint) for one in reasons)
-        ]
+        ] + [*judge_differences(judgement)]
 
     # -- reading ---------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from hostile_logs import gait
 
 from undulog.analysis import Options, analyse_session
 from undulog.capture import Session
-from undulog.capture.following.find import faults_in_session
+from undulog.capture.judgement.session import judgement_of_session
 from undulog.capture.log.read.sample_times import BREAK_S, longest_unbroken
 
 NS = 1_000_000_000
@@ -31,7 +31,7 @@ def test_the_longest_unbroken_stretch_gives_the_numbers(
     path = gait(tmp_path / "run.mcap", jumps=jumps, log_jumps=jumps if log_too else None)
     with Session.open(path) as session:
         found = analyse_session(session)
-        assert faults_in_session(session) == ()
+        assert judgement_of_session(session).faults == ()
     assert found.gait.frequency_hz.value == pytest.approx(1.0, abs=1e-4)
     for joint in found.joints:  # as the file was written
         assert joint.gain.value == pytest.approx(0.9, abs=2e-3)

@@ -32,7 +32,7 @@ def test_the_chosen_topics_are_those_that_are_judged(bag, report_of):
     report = report_of("log", "check", bag, *CHOSEN)
     assert frozen(report, "/arm/encoders") == {"front_yaw": 0, "mid_yaw": 4, "rear_yaw": 0}
     following, still = report["reasons"]
-    assert following.startswith("mid_yaw from 4 s to 7.99 s stands still while its command moves")
+    assert following.startswith("mid_yaw from 4 s to 8 s stands still while its command moves")
     assert still == "/arm/encoders, mid_yaw: frozen for 4 s while its command moved, at 4.000 s"
 
 

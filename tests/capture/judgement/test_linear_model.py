@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from undulog.capture.following.find import joints_not_following
-from undulog.capture.following.motion import JointMotion, Samples
+from undulog.capture.judgement.judge import judge
+from undulog.capture.judgement.motion import JointMotion, Samples
 
 T = np.arange(0.0, 80.0, 0.01)
 SERVO = signal.TransferFunction([1.0], [1 / 12.0**2, 1 / 12.0, 1.0])
@@ -31,7 +31,7 @@ def judged(command, *positions):
         JointMotion(f"j{k + 1}", Samples(T, command), Samples(T, position))
         for k, position in enumerate(positions)
     ]
-    return {fault.joint: fault for fault in joints_not_following(motions)}
+    return {fault.joint: fault for fault in judge(motions).faults}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
