@@ -26,6 +26,7 @@ from scipy.special import stdtrit
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from .exposure import ENOUGH_LIKE, REST_ERRORS, Exposure
 from .motion import Course, cycle_s
+from .stillness import FULL
 
 LEVEL = 0.01
 """Chance of any change in a session of healthy joints."""
@@ -242,9 +243,6 @@ def _regressed(
 
 SHORTEST = 2
 """Blocks of a change, at least: one alone may hold a step of the command that no response fits."""
-
-FULL = 0.9
-"""Share of its steps that a block needs, so that whole cycles are compared with whole cycles."""
 
 RIDGE = 1e-3
 """Ridge on gain and lag, relative to the median block: 0.1 % of what is known of them is lost."""

@@ -13,8 +13,9 @@ from math import isfinite
 
 import numpy as np
 
-from ..common.arrays import BoolArray, merged_ranges
+from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
+from .bursts import find_bursts
 from .changes import Jump, find_jumps
 from .exposure import (
     COHERENT,
@@ -78,16 +79,22 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     faults |= swapped
     for name, fault in record.items():
         # Missing samples are no reason for anything else; a counter's turns and old values are.
-        if name not in faults or "lost_samples" not in fault.kinds:
+        if name not in faults or fault.kinds != ("lost_samples",):
             faults[name] = fault
     usable = usable_steps(course, exposure, stillness)
     healthy = np.array([motion.name not in faults for motion in driven])
     usable &= healthy[:, None]
     names = [motion.name for motion in driven]
+    jumps = find_jumps(course, exposure, usable)
+    changed = {jump.joint for jump in jumps}
+    for k, share in find_bursts(course, exposure, usable).items():
+        if k not in changed:
+            text = f"{100 * share:.2g} % of its samples are far from where it can be"
+            faults[names[k]] = _whole(driven[k], ("noisy_sensor",), text)
     exposed: BoolArray = np.any(stillness.exposed, axis=1)
     return Judgement(
         faults=tuple(faults[m.name] for m in motions if m.name in faults),
-        changes=tuple(_change(names, jump) for jump in find_jumps(course, exposure, usable)),
+        changes=tuple(_change(names, jump) for jump in jumps),
         extra=tuple(
             ExtraMotion(names[line.joint], line.frequency_hz, line.amplitude_rad)
             for line in find_lines(course, exposure, usable)
@@ -128,10 +135,13 @@ def _faults(
         if not stillness.exposed[k].any():
             continue
         like = [driven[j] for j in exposure.group(k)]
-        others = np.delete(explained, k)
+        others = np.append(np.delete(explained, k), 0.0 if explained.size < 2 else explained.max())
         stands = _alone(stillness.stands[k], common)
         share = float(stands.sum()) / max(int(stillness.exposed[k].sum()), 1)
-        if response.gain < -RESPONDS and response.explained > COHERENT:
+        if (leader := _leader(course, exposure, k)) is not None:
+            text = f"carries out the command of {driven[leader].name}"
+            faults[motion.name] = _whole(motion, ("swapped",), text)
+        elif response.gain < -RESPONDS and response.explained > COHERENT:
             kinds, why = opposite_kinds(motion)
             text = f"moves against its command, gain {response.gain:.2f}"
             faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
@@ -141,12 +151,12 @@ def _faults(
         elif stands.any():
             spans = tuple(_trimmed(span, course, k, exposure) for span in _spans(stands, course))
             kinds, why = standing_kinds(motion, spans, like)
-            if len(spans) > 1 and "at_limit" not in kinds:
+            if len(spans) > 1 and not {"at_limit"} & {*kinds} and kinds != ("frozen_sensor",):
                 kinds = ("intermittent", *kinds)
             text = _stood(spans, course, k, exposure)
             text = f"{text}; {why}" if why else text
             faults[motion.name] = _fault(motion, kinds, spans, share, text)
-        elif response.explained < COHERENT and others.size and np.median(others) > ORDERLY:
+        elif _is_incoherent(course, exposure, k) and np.median(others) > ORDERLY:
             text = f"its command explains {100 * response.explained:.0f} % of its motion"
             faults[motion.name] = _whole(motion, ("dead", "noisy_sensor"), text)
     return faults
@@ -172,6 +182,38 @@ def _naming(
         if k != j
     }
     return in_words(naming, names), swapped
+
+
+def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
+    """Return whether a joint's motion, over times in which it has to respond, isn't its command's.
+
+    Over such times a zero that moved is a single step.
+    """
+    if exposure.responses[k].explained >= COHERENT:
+        return False
+    steps = max(1, int(exposure.settling_s[k] / course.step_s))
+    moved, asked = (
+        values[k, steps:] - values[k, :-steps] for values in (course.position, exposure.healthy)
+    )
+    limit = np.quantile(np.abs(moved), ORDERLY)
+    inside = np.abs(moved) <= max(float(limit), float(np.ptp(exposure.healthy[k])))
+    power = float(np.std(moved[inside]) * np.std(asked[inside]))
+    covariance = float(np.cov(moved[inside], asked[inside])[0, 1])
+    return power == 0 or abs(covariance) < COHERENT * power
+
+
+def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
+    """Return the joint whose command explains the motion of another, as its own does not."""
+    position: FloatArray = course.position[k]
+    position = position - position.mean()
+    healthy = exposure.healthy - np.mean(exposure.healthy, axis=1, keepdims=True)
+    left: FloatArray = np.mean((position[None, :] - healthy) ** 2, axis=1)
+    best = int(np.argmin(left))
+    opposite = float(np.var(position + healthy[k]))
+    rival = min(float(left[k]), opposite)
+    if best == k or left[best] > (1 - ORDERLY) * float(np.var(position)):
+        return None
+    return best if left[best] < RESPONDS * rival else None
 
 
 def _common_stands(stillness: Stillness) -> BoolArray:
@@ -220,6 +262,8 @@ def _trimmed(span: Span, course: Course, k: int, exposure: Exposure) -> Span:
     inside = np.flatnonzero((course.t_s >= span[0]) & (course.t_s < span[1]))
     position = course.position[k, inside]
     near = np.abs(position - np.median(position)) <= REST_ERRORS * exposure.rest_rad[k]
+    if not near.any():
+        return span
     there = course.t_s[inside[near]]
     return float(there[0]), float(there[-1]) + course.step_s
 

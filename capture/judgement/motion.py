@@ -16,6 +16,9 @@ time of the judgement of 25 joints stay below 0.1 GB and some seconds."""
 ALTERNATE = 1.5
 """Steps without a sample from which a course has none there: with less, rounding decides."""
 
+HYSTERESIS = 10
+"""Share of the range about its middle that is no crossing, inverse: noise is less than that."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -144,7 +147,3 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
     above = command[away] > (low + high) / 2
     rises = np.flatnonzero(away)[1:][above[1:] & ~above[:-1]]
     return float(np.median(np.diff(rises))) * step_s if rises.size > 2 else float("inf")
-
-
-HYSTERESIS = 10
-"""Share of the range about its middle that is no crossing, inverse: noise is less than that."""

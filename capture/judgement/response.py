@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
+from .motion import cycle_s
 
 LATEST_S = 0.3
 """Longest delay [s]: that of the independent fit by which accusations are checked."""
@@ -155,11 +156,12 @@ def fit_response(
     there = present[::stride][parts]
     filtered = Filtered(c, stride * step_s)
     trimmed = _Trimmed(filtered.output(USUAL), y, there.astype(np.float64))
-    best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids()]
-    step = LATEST_S / (DELAYS - 1)
+    bounds = _bounds(command, step_s)
+    best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids(*bounds)]
+    step = bounds[0] / (DELAYS - 1)
     for _ in range(ROUNDS):
         step /= 2
-        moved = [_moved(response, step) for _, response, _ in best]
+        moved = [_moved(response, step, *bounds) for _, response, _ in best]
         outputs = filtered.outputs([response for some in moved for response in some])
         ends = np.cumsum([len(some) for some in moved])
         for k, some in enumerate(moved):
@@ -169,10 +171,20 @@ def fit_response(
     return response if squares < trimmed.least_variance else replace(response, gain=0.0)
 
 
-def _grids() -> tuple[list[Response], ...]:
+def _bounds(command: FloatArray, step_s: float) -> tuple[float, float]:
+    """Return the longest delay and time constant [s].
+
+    Of a rhythm a quarter of a cycle and 1/(2 w): with more, a joint that moves the opposite way
+    would be one that is late by half a cycle.
+    """
+    cycle = cycle_s(command, step_s)
+    return min(LATEST_S, cycle / 4), min(SLOWEST_S, cycle / (2 * np.pi))
+
+
+def _grids(latest_s: float, slowest_s: float) -> tuple[list[Response], ...]:
     """Return the responses that the search begins with, by their order."""
-    delays = np.linspace(0, LATEST_S, DELAYS).tolist()
-    constants = [SLOWEST_S / 2**k for k in range(CONSTANTS)]
+    delays = np.linspace(0, latest_s, DELAYS).tolist()
+    constants = [slowest_s / 2**k for k in range(CONSTANTS)]
     few = delays[:: DELAYS // 2]
     return (
         [Response(delay_s=delay) for delay in delays],
@@ -196,13 +208,14 @@ def _merit(fit: _Fit) -> tuple[float, int, float]:
     return squares, response.order, response.delay_s
 
 
-def _moved(centre: Response, step_s: float) -> list[Response]:
+def _moved(centre: Response, step_s: float, latest_s: float, slowest_s: float) -> list[Response]:
     """Return the neighbours of a response, a step of delay or time constant away."""
     found: list[Response] = []
     for k in (-1, 0, 1):
         for j in (-1, 0, 1) if centre.order else (0,):
-            delay = min(max(centre.delay_s + k * step_s, 0.0), LATEST_S)
-            constant = min(max(centre.constant_s + j * step_s, 0.0), SLOWEST_S)
+            delay = min(max(centre.delay_s + k * step_s, 0.0), latest_s)
+            slowest = slowest_s / max(centre.order, 1)
+            constant = min(max(centre.constant_s + j * step_s, 0.0), slowest)
             if k or j:
                 found.append(replace(centre, delay_s=delay, constant_s=constant))
     return found

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
-from .exposure import RESPONDS
+from .exposure import COHERENT, RESPONDS
 from .fault import Span
 from .motion import JointMotion, Samples
 
@@ -56,16 +56,28 @@ def standing_kinds(
             return ("frozen_sensor",), "the velocity goes on"
         # A motor turns on behind a broken gear, too.
         return (*at_limit, "frozen_sensor", "dead"), "its velocity goes on"
+    kinds, why = _by_effort(motion, spans, like, kinds)
+    return (*at_limit, *kinds), why
+
+
+def _by_effort(
+    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion], kinds: list[str]
+) -> tuple[list[str], str]:
+    """Return the kinds that the effort leaves of those that fit, and what decides."""
     size = _effort(motion, spans, like)
     if size is None:
-        return (*at_limit, *kinds), ""
+        return kinds, ""
+    if motion.effort is not None and _repeats(motion.effort, within(motion.effort.t_s, spans)):
+        return [*kinds, "stale_sensor"], "its effort repeats one value, too"
     if size < POWERLESS:
-        return (*at_limit, "dead"), f"its effort is {100 * size:.0f} % of the usual one"
+        return ["dead"], f"its effort is {100 * size:.0f} % of the usual one"
     driven = [kind for kind in kinds if kind != "dead"]
-    why = f"its effort is {size:.1f} times the usual one"
+    if _is_constant(motion.effort, spans):
+        driven = ["stalled", *driven]
     if "effort" in motion.outside_loop:
-        driven = ["jammed"] if size > PUSHES or "frozen_sensor" not in driven else ["frozen_sensor"]
-    return (*at_limit, *(driven or kinds)), why
+        pushes = size > PUSHES or "frozen_sensor" not in driven or "stalled" in driven
+        driven = [kind for kind in driven if (kind == "frozen_sensor") is not pushes]
+    return driven or kinds, f"its effort is {size:.1f} times the usual one"
 
 
 def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
@@ -123,14 +135,27 @@ def _moves(
     """Return whether another quantity moves as commanded; None where it wasn't recorded."""
     if samples is None:
         return None
-    inside = within(samples.t_s, spans)
-    if np.count_nonzero(inside) <= AGAIN:
+    parts: list[FloatArray] = []
+    for span in spans:
+        inside = within(samples.t_s, [span])
+        if np.count_nonzero(inside) > AGAIN:
+            t_s = samples.t_s[inside]
+            asked = command.at(t_s)
+            speed = np.gradient(asked, t_s)
+            leading = speed, np.gradient(speed, t_s)
+            rows = np.stack([samples.values[inside], *(leading if rate else (asked, speed))])
+            parts.append(rows - rows.mean(axis=1, keepdims=True))
+    if not parts:
         return None
-    t_s, values = samples.t_s[inside], samples.values[inside]
-    asked = command.at(t_s)
-    asked = np.gradient(asked, t_s) if rate else asked
+    values, asked, lagging = np.concatenate(parts, axis=1)
     size = float(np.std(asked))
-    return bool(size > 0 and np.std(values) > RESPONDS * size) if size > 0 else None
+    if size == 0:
+        return None
+    design = np.stack([asked, lagging], axis=1)
+    factors = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
+    left: FloatArray = values - design @ factors
+    explained = 1 - float(np.var(left)) / max(float(np.var(values)), 1e-300)
+    return bool(np.std(values) > RESPONDS * size and explained > COHERENT)
 
 
 def _effort(
@@ -150,6 +175,15 @@ def _effort(
     if usual is None:
         usual = _size(motion.effort, spans, inside=False)
     return here / usual if usual else None
+
+
+def _is_constant(effort: Samples | None, spans: Sequence[Span]) -> bool:
+    """Return whether an effort keeps one value."""
+    if effort is None:
+        return False
+    values = effort.values[within(effort.t_s, spans)]
+    level = float(np.median(values))
+    return float(np.median(np.abs(values - level))) < NEAR_LIMIT * abs(level)
 
 
 def _size(effort: Samples | None, spans: Sequence[Span], *, inside: bool) -> float | None:

@@ -16,6 +16,9 @@ from .exposure import RESPONDS, Exposure, covered, window_ranges
 from .motion import Course, cycle_s
 from .response import SETTLED
 
+FULL = 0.9
+"""Share of its samples that a window needs: of fewer it isn't known how far the joint moved."""
+
 
 @dataclass(frozen=True)
 class Stillness:
@@ -54,12 +57,14 @@ def _of_joint(course: Course, exposure: Exposure, k: int) -> tuple[BoolArray, Bo
     moved = window_ranges(course.position[k], [length + 2 * settling for length in lengths])
     of_fit = window_ranges(exposure.fitted[k], lengths) if _follows(exposure, k) else asked
     least = exposure.least_rad[k]
+    absent = np.concatenate([[0], np.cumsum(~course.present[k])])
     for length, healthy, seen, fitted in zip(lengths, asked, moved, of_fit, strict=True):
         inner = slice(settling, settling + seen.size)
         expected: FloatArray = np.minimum(healthy, fitted)[inner]
-        had_to = healthy[inner] > least
-        still = had_to & (seen < RESPONDS * expected) & (expected > least)
         wide = length + 2 * settling
+        complete = absent[wide:] - absent[:-wide] <= (1 - FULL) * wide
+        had_to = (healthy[inner] > least) & complete
+        still = had_to & (seen < RESPONDS * expected) & (expected > least)
         exposed |= covered(had_to, wide, size)
         stands |= covered(still, wide, size)
     return exposed, stands

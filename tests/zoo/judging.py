@@ -9,6 +9,18 @@ MOST_NAMED = 4
 """So many joints a sentence must name; with more it may count the rest."""
 
 
+DETECTION = "detection"
+
+SHOWN = {
+    "offset": frozenset({"slipped", "slipped_sensor", "drifting_sensor"}),
+    "noise": frozenset({"noisy_sensor"}),
+}
+"""Quantities whose change shows kinds of fault."""
+
+LOOP = frozenset({"jammed", "dead", "stalled", "frozen_sensor"})
+"""Kinds that effort and velocity of a servo's own loop can't separate."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """One output of one session.
@@ -47,6 +59,7 @@ def judge(output, statement, truth, robot):
     expected = [name for name, one in planted.items() if _must_name(output, one)]
     first = named_in(statement.text, robot.names)
     listed = [*(statement.not_following or ()), *(statement.stands_out or ())]
+    listed += list(statement.changes)
     sound = tuple(dict.fromkeys(n for n in [*listed, *first] if n not in planted))
     if truth.undecided and output != "compare":
         return _undecided(statement, [*listed, *first])
@@ -62,7 +75,7 @@ def judge(output, statement, truth, robot):
         missing.append("calls a healthy bag less than good")
     narrow = False
     for name, one in planted.items() if statement.not_following is not None else ():
-        wrong, few = _of_joint(name, one, statement, robot)
+        wrong, few = _of_joint(name, one, statement, robot, outside=output == DETECTION)
         missing += wrong
         narrow |= few
     return Judgement(tuple(missing), sound, narrow)
@@ -85,27 +98,33 @@ def _undecided(statement, named):
     return Judgement(tuple(missing))
 
 
-def _of_joint(name, truth, statement, robot):
+def _of_joint(name, truth, statement, robot, *, outside):
     """What is wrong in the lists about one planted joint; whether its kinds are too few."""
     stated = (statement.not_following or {}).get(name)
-    outside = (statement.stands_out or {}).get(name, frozenset())
+    changed = statement.changes.get(name, frozenset())
+    shown = (statement.stands_out or {}).get(name, frozenset()) | changed
+    shown_kinds = frozenset().union(*(SHOWN.get(quantity, frozenset()) for quantity in changed))
+    elsewhere = statement.stands_out is None and (truth.stands_out or not truth.names)
+    if shown_kinds & truth.names or changed & truth.stands_out or (stated is None and elsewhere):
+        return [], False  # by what changed, or left to another output
     if stated is None:
-        if statement.stands_out is None and (truth.stands_out or not truth.names):
-            return [], False  # left to another output
-        if outside & truth.stands_out:
+        if shown & truth.stands_out:
             return [], False
-        if outside:
-            return [f"{name} stands out by {_listed(outside)} only"], False
+        if shown:
+            return [f"{name} stands out by {_listed(shown)} only"], False
         return [f"{name} not listed"], False
     if not truth.names:
         return [f"{name} listed as {_listed(stated.kinds)}, but follows"], False
     wrong = []
     if not stated.kinds & truth.names:
         wrong.append(f"{name}: {_listed(stated.kinds)} lacks {_listed(truth.names, ' or ')}")
-    if excess := stated.kinds - truth.allowed:
+    allowed = truth.allowed
+    if not outside and allowed & LOOP:  # a bag doesn't say where effort and velocity are measured
+        allowed |= LOOP
+    if excess := stated.kinds - allowed:
         wrong.append(f"{name}: {_listed(excess)} excluded by the data")
     wrong += _onset(name, truth, stated.since_s, robot)
-    return wrong, stated.kinds < truth.allowed
+    return wrong, stated.kinds < allowed
 
 
 def _onset(name, truth, since_s, robot):

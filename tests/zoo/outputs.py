@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import unescape
 
 import numpy as np
@@ -49,6 +49,7 @@ class Statement:
         undecided: Whether it says that no joint can be named.
         alike: Whether it claims that the joints move alike, or that two sessions are the same.
         error: What went wrong instead, or empty.
+        changes: Joint name to the quantities that changed during the session.
     """
 
     text: str
@@ -57,6 +58,7 @@ class Statement:
     undecided: bool | None = None
     alike: bool = False
     error: str = ""
+    changes: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
 
 def statements(path, healthy, *, second, outputs=OUTPUTS):
@@ -104,7 +106,9 @@ def structured(answer):
     for one in answer.stand_out:
         quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
     undecided, alike = answer.undecided is not None, bool(answer.alike)
-    return Statement(answer.sentence, _named(answer.not_following), quantities, undecided, alike)
+    named = _named(answer.not_following)
+    changed = _changed(answer.changes)
+    return Statement(answer.sentence, named, quantities, undecided, alike, changes=changed)
 
 
 def detected(log):
@@ -119,21 +123,29 @@ def detected(log):
         return Samples(robot.t_s[kept, j], columns[kept, j])
 
     logged = {"velocity": log.velocity, "effort": log.effort, "reference": log.second}
+    # Effort is that of the true position, and so is a velocity of its own.
+    outside = frozenset({"effort", *(["velocity"] if robot.channels.velocity == "true" else [])})
     motions = [
         JointMotion(
             name,
             Samples(robot.sent_s, sent[:, j]),
             samples(log.position, j),
             **{key: samples(columns, j) for key, columns in logged.items()},
+            outside_loop=outside,
         )
         for j, name in enumerate(robot.names)
     ]
-    found = _named(judge(motions).faults)
-    return Statement(" ".join(found), found)
+    judgement = judge(motions)
+    found, changed = _named(judgement.faults), _changed(judgement.changes)
+    return Statement(" ".join(found | changed), found, changes=changed)
 
 
 def _named(faults):
     return {one.joint: Named(frozenset(one.kinds), one.since_s) for one in faults}
+
+
+def _changed(changes):
+    return {one.joint: frozenset({one.quantity}) for one in changes}
 
 
 def _compared(healthy, path, options):

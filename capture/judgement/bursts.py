@@ -1,0 +1,53 @@
+"""Samples far from where a joint can be, more of them than its like joints have: a noisy sensor.
+
+A sample is far where the residual of the joint's response is beyond what a healthy joint loses and
+eight robust standard deviations of its own. Heavy-tailed noise that all joints have makes such
+samples of all of them; the count is tested against the median share of the like joints (binomial).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import bdtrc
+
+from ..common.arrays import BoolArray, FloatArray
+from .changes import ROBUST, TAME
+from .exposure import ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
+from .motion import Course
+from .record import RARE
+
+FEW = 0.003
+"""Share of far samples that any joint may have: lost packets that a driver fills, a few in a
+thousand."""
+
+
+def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[int, float]:
+    """Find the joints with more far samples than their like joints.
+
+    Args:
+        usable: Steps that are looked at, shape (k, n).
+
+    Returns:
+        Index of a joint to the share of its samples that are far.
+    """
+    residual = course.position - exposure.fitted
+    count = usable.sum(axis=1)
+    far = np.array([_far(residual[k][usable[k]]) for k in range(len(residual))], dtype=np.float64)
+    share = far / np.maximum(count, 1)
+    found: dict[int, float] = {}
+    for k in range(len(residual)):
+        others = [j for j in exposure.group(k) if j != k and count[j]]
+        if len(others) < ENOUGH_LIKE - 1:
+            continue
+        usual = min(FEW + 2 * float(np.median(share[others])), 1.0)
+        if far[k] and bdtrc(far[k] - 1, count[k], usual) < RARE:
+            found[k] = float(share[k])
+    return found
+
+
+def _far(residual: FloatArray) -> int:
+    if residual.size == 0:
+        return 0
+    away = np.abs(residual - np.median(residual))
+    limit = max(float(LARGEST_REST_RAD), 2 * TAME * ROBUST * float(np.median(away)))
+    return int(np.count_nonzero(away > limit))
