@@ -5,8 +5,8 @@ series of a joint, less what all joints of a session have in common, is taken as
 
 .. math:: e_i = \rho e_{i-1} + \sqrt{1 - \rho^2}\, \sigma_j z_i
 
-with a scatter for each joint, with rho pooled over the joints, and the tails of z (Student's t)
-over the quantities, too: where joints are mounted anew or batteries fail, all have outliers. The
+with a scatter for each joint, with rho pooled over the joints, and over the quantities that don't
+contradict it, and the tails of z (Student's t) over all. The
 lag-one correlation of short series is biased towards zero (Kendall, Biometrika 41, 1954), and more
 so once conditions and the other joints are subtracted. So rho and the tails are those whose
 simulated estimates have the observed one as their median, and the upper 90 % limit of rho is that
@@ -23,16 +23,18 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-_RHOS = np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
+_RHOS = np.array([0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.95, 0.98])
 """Lag-one correlations that are simulated; beyond, noise is a random walk over 50 sessions."""
-_TAILS = np.array([0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5])
+_TAILS = np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5])
 """Inverse degrees of freedom that are simulated: from normal noise to infinite variance."""
-_DRAWS = (50, 200)
-"""Fewest and most simulations of each: with 200 the 10 % point has a level of 8 to 12 %; a long
+_DRAWS = (50, 100)
+"""Fewest and most simulations of each: with 100 the 10 % point has a level of 7 to 13 %; a long
 series narrows the limit itself."""
-_MOST_VALUES = 400_000
-"""Simulated values of each, for 200 simulations of 60 sessions of 25 joints."""
+_MOST_VALUES = 200_000
+"""Simulated values of each, for 100 simulations of 80 sessions of 25 joints."""
 _UPPER = 0.9
+_ALIKE = 0.95
+"""Quantities whose correlation lies in its interval of this level have that of all together."""
 _KEPT = 0.8
 """Share of the differences, the smallest, that the scatter is computed from: with a fifth at
 changes and outliers it is hardly larger."""
@@ -137,31 +139,66 @@ def estimate_noise(
         series: As :func:`relative_to_others` gives them, each of shape (n_sessions, n_joints).
         conditions: Number of each session's condition, shape (n_sessions,).
     """
+    if not series:
+        return []
+    draws = int(np.clip(_MOST_VALUES // max(relative.size for relative in series), *_DRAWS))
+    normals = [rng.standard_normal((draws, *relative.shape)) for relative in series]
+    single = [
+        _lag_one_of(relative, conditions, normal)
+        for relative, normal in zip(series, normals, strict=True)
+    ]
+    total, total_by_rho = (
+        sum(r for r, _ in single),
+        np.sum([by_rho for _, by_rho in single], axis=0),
+    )
+    common, upper = _memory(total, total_by_rho, 0.5, 1 - _UPPER)
     noises: list[SessionNoise] = []
     observed, simulated = 0.0, np.zeros((len(_TAILS), 1))
-    for relative in series:
-        residuals, present = centred(relative, conditions), np.isfinite(relative)
-        draws = int(np.clip(_MOST_VALUES // relative.size, *_DRAWS))
-        normal, even = rng.standard_normal((draws, *relative.shape)), np.ones_like(relative[0])
-        by_rho = np.stack(
-            [_lag_one(_residuals_of(normal, rho, even, present, conditions)) for rho in _RHOS]
+    for relative, normal, (lag_one, by_rho) in zip(series, normals, single, strict=True):
+        least, most = _memory(lag_one, by_rho, (1 + _ALIKE) / 2, (1 - _ALIKE) / 2)
+        alike = least <= common <= most
+        memory = (common, upper) if alike else _memory(lag_one, by_rho, 0.5, 1 - _UPPER)
+        noise = _scatter_of(relative, memory, conditions, normal)
+        present = np.isfinite(relative)
+        even = replace(noise, upper=noise.rho, scatter=np.ones_like(noise.scatter))
+        observed += float(_heaviness(centred(relative, conditions), noise))
+        simulated = simulated + np.stack(
+            [
+                _heaviness(simulate(even, tail, present, conditions, normal), noise)
+                for tail in _TAILS
+            ]
         )
-        lag_one = float(_lag_one(residuals))
-        rho = _inverted(lag_one, np.median(by_rho, axis=1), _RHOS)
-        upper = _inverted(lag_one, np.quantile(by_rho, 1 - _UPPER, axis=1), _RHOS)
-        drawn = [
-            _residuals_of(innovations(normal, tail, rng), rho, even, present, conditions)
-            for tail in _TAILS
-        ]
-        observed += float(_heaviness(residuals))
-        simulated = simulated + np.stack([_heaviness(values) for values in drawn])
-        by_chance = _log_scatter(drawn[0], rho)
-        sampling = float(by_chance[:, np.isfinite(by_chance).all(axis=0)].var(axis=0).mean())
-        size = scatter(residuals, rho, sampling)
-        noises.append(SessionNoise(rho, upper, 0.0, 0.0, sampling, size))
+        noises.append(noise)
     tail = _inverted(observed, np.median(simulated, axis=1), _TAILS)
-    least = _inverted(observed, np.quantile(simulated, _UPPER, axis=1), _TAILS)
-    return [replace(noise, tail=tail, least_tail=least) for noise in noises]
+    least_tail = _inverted(observed, np.quantile(simulated, _UPPER, axis=1), _TAILS)
+    return [replace(noise, tail=tail, least_tail=least_tail) for noise in noises]
+
+
+def _lag_one_of(
+    relative: FloatArray, conditions: IntArray, normal: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return the lag-one correlation as observed, and simulated, shape (n_rhos, draws)."""
+    even, present = np.ones_like(relative[0]), np.isfinite(relative)
+    draws = [_lag_one(_residuals_of(normal, rho, even, present, conditions)) for rho in _RHOS]
+    return float(_lag_one(centred(relative, conditions))), np.stack(draws)
+
+
+def _memory(observed: float, by_rho: FloatArray, *quantiles: float) -> tuple[float, ...]:
+    """Return the correlations of which the observed one is a quantile."""
+    return tuple(_inverted(observed, np.quantile(by_rho, q, axis=1), _RHOS) for q in quantiles)
+
+
+def _scatter_of(
+    relative: FloatArray, memory: Sequence[float], conditions: IntArray, normal: FloatArray
+) -> SessionNoise:
+    """Return noise with the scatter of each joint; its tails are not known here."""
+    rho, upper = memory
+    even, present = np.ones_like(relative[0]), np.isfinite(relative)
+    drawn = _residuals_of(normal, rho, even, present, conditions)
+    by_chance = _log_scatter(drawn, rho)
+    sampling = float(by_chance[:, np.isfinite(by_chance).all(axis=0)].var(axis=0).mean())
+    size = scatter(centred(relative, conditions), rho, sampling)
+    return SessionNoise(rho, upper, 0.0, 0.0, sampling, size)
 
 
 def _inverted(observed: float, simulated: FloatArray, parameters: FloatArray) -> float:
@@ -185,18 +222,20 @@ def _lag_one(residuals: FloatArray) -> FloatArray:
     return np.where(kept, ratio, 0.0).sum(axis=-1) / np.maximum(kept.sum(axis=-1), 1)
 
 
-def _heaviness(residuals: FloatArray) -> FloatArray:
-    """Return the 97.5 % point over the median of all joints' standardised differences.
+def _heaviness(residuals: FloatArray, noise: SessionNoise) -> FloatArray:
+    """Return the 97.5 % point over the median of all joints' differences over their scatter.
 
     A fortieth of the values may be changes and outliers without moving it much.
     """
-    sizes = np.abs(np.diff(residuals, axis=-2))
-    middle = _median(sizes, axis=-2)
-    sizes = np.where(middle > 0, sizes / np.where(middle > 0, middle, 1.0), np.nan)
+    size = scatter(residuals, noise.rho, noise.sampling)[..., None, :]
+    sizes = np.where(
+        size > 0, np.abs(np.diff(residuals, axis=-2)) / np.maximum(size, 1e-300), np.nan
+    )
     flat = np.sort(sizes.reshape(*sizes.shape[:-2], -1), axis=-1)
-    last = np.isfinite(flat).sum(axis=-1, keepdims=True) - 1
-    point = np.maximum(np.floor(0.975 * last).astype(np.int64), 0)
-    return np.nan_to_num(np.take_along_axis(flat, point, axis=-1)[..., 0])
+    last = np.maximum(np.isfinite(flat).sum(axis=-1, keepdims=True) - 1, 0)
+    points = [np.floor(share * last).astype(np.int64) for share in (0.5, 0.975)]
+    middle, far = (np.take_along_axis(flat, point, axis=-1)[..., 0] for point in points)
+    return np.nan_to_num(far / middle)
 
 
 def innovations(normal: FloatArray, tail: float, rng: np.random.Generator) -> FloatArray:

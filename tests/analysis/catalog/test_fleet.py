@@ -10,6 +10,7 @@ import pytest
 
 from support.linear_chain import CHAIN, WAVE, M, write_run
 from undulog.analysis.catalog.catalog import Catalog
+from undulog.analysis.catalog.change_points import Judged
 from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
 DAY_NS = 86_400_000_000_000
@@ -87,6 +88,15 @@ def without_models(monkeypatch):
 
 
 @pytest.fixture
+def without_changes(monkeypatch):
+    """Look for no changes, which takes the rest."""
+    monkeypatch.setattr(
+        "undulog.analysis.catalog.fleet.find_change_points",
+        lambda series, *_: [Judged()] * len(series),
+    )
+
+
+@pytest.fixture
 def few_simulations(monkeypatch):
     """Simulate a fifth of the fleets, which takes a fifth of the time."""
     monkeypatch.setattr("undulog.analysis.catalog.change_points._SIMULATIONS", 199)
@@ -115,7 +125,7 @@ def test_variance_components_are_those_planted():
     assert robot.changes == ()
 
 
-def test_a_trend_is_that_planted(without_models, few_simulations):
+def test_a_trend_is_that_planted(without_models, without_changes):
     sessions, rows, _, _ = frames(8)
     days = (sessions.start - FIRST) / pd.Timedelta(days=1)
     drifting = sessions.assign(lag_sd=0.01 + 0.001 * days)
@@ -127,7 +137,7 @@ def test_a_trend_is_that_planted(without_models, few_simulations):
     assert low - 1e-9 <= 0.001 <= high + 1e-9
 
 
-def test_results_of_a_sweep_are_held_against_its_parameters(without_models, few_simulations):
+def test_results_of_a_sweep_are_held_against_its_parameters(without_models, without_changes):
     sessions, rows, _, _ = frames(3)
     torque = np.random.default_rng(0).permutation(np.geomspace(0.2, 1.0, len(sessions)))
     swept = sessions.assign(
@@ -157,7 +167,7 @@ def test_an_odd_session_is_an_outlier_and_no_change(without_models, few_simulati
     assert first.deviation == pytest.approx(0.2, abs=0.04)
 
 
-def test_incomplete_sessions_are_reported(without_models, few_simulations):
+def test_incomplete_sessions_are_reported(without_models, without_changes):
     sessions, rows, _, _ = frames(1, n=40)
     partly = sessions.assign(status=np.where(np.arange(40) < 4, "not analysed", "analysed"))
     gone = (rows.path == "run020.mcap") | ((rows.path == "run021.mcap") & (rows.position == 3))
