@@ -104,14 +104,15 @@ def few_simulations(monkeypatch):
 
 
 def test_a_worn_joint_is_named_with_its_date(without_models, few_simulations):
-    sessions, rows, name, begun = frames(3, "step")
+    sessions, rows, name, begun = frames(3, "step", n=40, joints=7)
     fleet = analyse_fleet(sessions, rows)
     (change,) = fleet.robots[0].changes
     assert (change.joint, change.quantity, change.gradual) == (name, "gain", False)
     assert change.earliest <= begun.isoformat() <= change.latest
     assert change.change == pytest.approx(-0.055, abs=0.01)
     assert f"the gain of {name} falls by" in fleet.answer
-    assert begun.date().isoformat() in fleet.answer
+    assert f"from {change.date[:10]} on" in fleet.answer
+    assert "lag-one correlation of sessions: gain 0.0" in fleet.answer
 
 
 @pytest.mark.nightly
@@ -157,7 +158,7 @@ def test_results_of_a_sweep_are_held_against_its_parameters(without_models, with
 
 
 def test_an_odd_session_is_an_outlier_and_no_change(without_models, few_simulations):
-    sessions, rows, _, _ = frames(5)
+    sessions, rows, _, _ = frames(5, n=40, joints=7)
     at = (rows.path == "run030.mcap") & (rows.joint == "joint04")
     rows.loc[at, "lag_rad"] += 0.2
     (robot,) = analyse_fleet(sessions, rows).robots
