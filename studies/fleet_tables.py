@@ -59,7 +59,7 @@ NULLS = (
 STEPS = (
     Case("5 %, scatter 1 %, 20 sessions", sessions=(20, 20), steps=(-0.05,)),
     Case("5 %, scatter 2 %, 60 sessions", sessions=(60, 60), scatter=0.02, steps=(-0.05,)),
-    Case("the same, in the middle half", sessions=(20, 20), steps=(-0.05,), within=0.25),
+    Case("5 %, in the middle half, 20 sessions", sessions=(20, 20), steps=(-0.05,), within=0.25),
     Case("-6 and +4 %, scatter 1 %, 40 sessions", sessions=(40, 40), steps=(-0.06, 0.04)),
 )
 

@@ -133,7 +133,7 @@ def _log_scatter(residuals: FloatArray, rho: float) -> FloatArray:
 def estimate_noise(
     series: Sequence[FloatArray], conditions: IntArray, rng: np.random.Generator
 ) -> list[SessionNoise]:
-    """Estimate the noise of each quantity; they share the tails.
+    """Estimate the noise of each quantity; they share the tails, and the memory where they agree.
 
     Args:
         series: As :func:`relative_to_others` gives them, each of shape (n_sessions, n_joints).
@@ -147,10 +147,8 @@ def estimate_noise(
         _lag_one_of(relative, conditions, normal)
         for relative, normal in zip(series, normals, strict=True)
     ]
-    total, total_by_rho = (
-        sum(r for r, _ in single),
-        np.sum([by_rho for _, by_rho in single], axis=0),
-    )
+    total = sum(lag_one for lag_one, _ in single)
+    total_by_rho = np.sum([by_rho for _, by_rho in single], axis=0)
     common, upper = _memory(total, total_by_rho, 0.5, 1 - _UPPER)
     noises: list[SessionNoise] = []
     observed, simulated = 0.0, np.zeros((len(_TAILS), 1))

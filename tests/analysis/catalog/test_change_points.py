@@ -99,6 +99,16 @@ def test_memory_is_without_bias_and_its_limit_holds(rho):
     assert sum(noise.upper >= rho for noise in noises) >= 5  # binomial, 90 %: 5 of 8 in 99.5 %
 
 
+def test_quantities_with_different_memory_have_their_own():
+    nothing, rng = np.zeros(60, np.int64), np.random.default_rng(3)
+    series = [relative_to_others(ar1(8, 60, 8, rho), nothing) for rho in (0.0, 0.3, 0.9)]
+    rhos = [noise.rho for noise in estimate_noise(series, nothing, rng)]
+    assert rhos[0] < 0.15
+    assert rhos[2] > 0.7
+    alike = [relative_to_others(ar1(seed, 60, 8, 0.3), nothing) for seed in (1, 2, 3)]
+    assert len({noise.rho for noise in estimate_noise(alike, nothing, rng)}) == 1
+
+
 def test_two_changes_and_an_outlier_of_one_joint_are_found_by_themselves():
     values = 0.01 * ar1(5, 60, 6, 0.3)
     values[20:, 2] += 0.06
@@ -167,8 +177,8 @@ def all_simulations(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("all_simulations")
-@pytest.mark.parametrize("case", fleet_tables.NULLS[1:3], ids=lambda case: case.name)
-def test_of_fifty_fleets_without_changes_hardly_any_has_one(case):
+def test_of_fifty_fleets_with_memory_and_without_changes_hardly_any_has_one():
+    case = fleet_tables.Case("rho 0.6, 20 sessions", 0.6, sessions=(20, 20))
     assert fleet_tables.count(case, 50)["any"] <= MOST[50]
 
 
