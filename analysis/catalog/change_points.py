@@ -296,6 +296,7 @@ def _tails(
             residuals = simulate(noise, tail, present, conditions, normal)
             t = np.zeros(len(normal))
             size = scatter(residuals, noise.rho, noise.sampling)
+            size[size <= 0] = np.inf  # a joint that is constant isn't looked at
             for column in columns:
                 rows = present[:, column]
                 shapes = of_joints[rows.tobytes()]

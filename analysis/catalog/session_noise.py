@@ -38,6 +38,9 @@ _ALIKE = 0.95
 _KEPT = 0.8
 """Share of the differences, the smallest, that the scatter is computed from: with a fifth at
 changes and outliers it is hardly larger."""
+_SAME = 1e-12
+"""Variance over the largest of the joints that is one of rounding: of few joints one is the median,
+less which it is 0, in many sessions."""
 _TRIMMED = 0.4377
 r"""Mean of the smallest 80 % of squares of standard normal numbers: 1 - 2 q phi(q) / 0.8, with q =
 1.2816 the 90 % point and phi the density."""
@@ -127,7 +130,8 @@ def _log_scatter(residuals: FloatArray, rho: float) -> FloatArray:
     kept = np.where(rank < most, squares, 0.0)
     mean = kept.sum(axis=-2) / np.maximum(most[..., 0, :], 1)
     variance = mean / (2 * (1 - rho) * _TRIMMED)
-    return 0.5 * np.log(np.where(variance > 0, variance, np.nan))
+    varies = variance > _SAME * variance.max(axis=-1, keepdims=True)
+    return 0.5 * np.log(np.where(varies, variance, np.nan))
 
 
 def estimate_noise(
@@ -194,7 +198,8 @@ def _scatter_of(
     even, present = np.ones_like(relative[0]), np.isfinite(relative)
     drawn = _residuals_of(normal, rho, even, present, conditions)
     by_chance = _log_scatter(drawn, rho)
-    sampling = float(by_chance[:, np.isfinite(by_chance).all(axis=0)].var(axis=0).mean())
+    known = by_chance[:, np.isfinite(by_chance).all(axis=0)]
+    sampling = float(known.var(axis=0).mean()) if known.size else 0.0
     size = scatter(centred(relative, conditions), rho, sampling)
     return SessionNoise(rho, upper, 0.0, 0.0, sampling, size)
 

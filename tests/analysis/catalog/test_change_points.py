@@ -47,7 +47,15 @@ def test_constant_and_short_series_have_no_change():
     assert [quantity.points for quantity in results] == [(), ()]
     assert results[0].noise is None
     (few,) = find_change_points([holes[:7]], times[:7], nothing[:7])
-    assert (few.noise, few.smallest) == (None, math.inf)
+    (alone,) = find_change_points([holes], times, np.arange(20))
+    for quantity in (few, alone):
+        assert (quantity.noise, quantity.smallest) == (None, math.inf)
+
+
+def test_of_three_joints_and_eight_sessions_little_is_decided():
+    quantity = judged(0.01 * np.random.default_rng(0).normal(size=(8, 3)))
+    assert quantity.points == ()
+    assert 0.03 < quantity.smallest < 10  # with everything known 0.04
 
 
 def test_one_joint_does_not_move_the_others():
