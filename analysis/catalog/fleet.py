@@ -135,8 +135,8 @@ class Memory:
         upper: Its upper 90 % limit, for which the level holds.
         smallest_step: In the middle of the sessions, found in 9 of 10 robots; unit of
             :attr:`JointChange.change`.
-        sessions_needed: About how many sessions show a step of :data:`SIZES`. With fewer than
-            these, that nothing is found decides nothing.
+        sessions_needed: About how many sessions show a step of :data:`SIZES`, or more than there
+            are if no joint has enough. With fewer, that nothing is found decides nothing.
     """
 
     quantity: str
@@ -246,7 +246,9 @@ def _unchanged(history: RobotHistory) -> str:
     decided = [memory for memory in history.memory if memory.sessions_needed <= history.sessions]
     parts: list[str] = []
     if decided:
-        sizes = ", ".join(f"{m.quantity} {size_text(m.quantity, m.smallest_step)}" for m in decided)
+        sizes = ", ".join(
+            f"{m.quantity} {_size_text(m.quantity, m.smallest_step)}" for m in decided
+        )
         parts.append(
             f"no joint changes over {history.sessions} sessions, where steps show ({sizes})"
         )
@@ -264,17 +266,14 @@ def _correlations(history: RobotHistory) -> str:
     return f"; lag-one correlation of sessions: {listed}"
 
 
-def size_text(quantity: str, value: float | None) -> str:
-    """Return the size of a change as people read it."""
-    if value is None:
-        return "none"
-    by = abs(value)
+def _size_text(quantity: str, value: float | None) -> str:
+    by = abs(value or 0.0)
     return f"{math.degrees(by):.2g}°" if quantity == "lag" else f"{by * 100:.2g} %"
 
 
 def sentence(change: JointChange) -> str:
     """Return a change in words, without a full stop."""
-    size = size_text(change.quantity, change.change)
+    size = _size_text(change.quantity, change.change)
     way = "rises" if change.change > 0 else "falls"
     gradually = ", gradually," if change.gradual else ""
     return (
@@ -395,7 +394,7 @@ def _outlier(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) ->
 def _memory(quantity: str, judged: Judged, sessions: int) -> Memory:
     """Return how much a quantity remembers, and what could be found in it."""
     if judged.noise is None:
-        return Memory(quantity, None, None, None, LEAST_SESSIONS)
+        return Memory(quantity, None, None, None, max(LEAST_SESSIONS, sessions + 1))
     needed = math.ceil(sessions * (judged.smallest / SIZES[quantity]) ** 2)
     return Memory(
         quantity=quantity,
