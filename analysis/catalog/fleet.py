@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -21,17 +20,23 @@ from undulog.capture.common.errors import MissingExtraError
 
 from ..estimators.intervals import holm
 from ..results.estimate import Interval
-from .change_points import LEAST_SESSIONS, LEVEL, find_change_points, relative_to_others
+from .change_points import LEAST_SESSIONS, ChangePoint, Judged, Kind, find_change_points
+from .session_noise import relative_to_others
 
 _Frame: TypeAlias = Any  # pandas.DataFrame; its stubs don't know the columns' types
 
 QUANTITIES = {"gain": "gain", "lag": "lag [rad]", "energy": "energy [W]"}
 """Quantity of a joint to its name with the unit."""
 
+SIZES = {"gain": math.log(1.05), "lag": 0.05, "energy": math.log(1.1)}
+"""Changes that matter, of ln gain, lag [rad] and ln energy: a twentieth of the amplitude, in phase
+or a quarter of a cycle from it, and of energy, which goes with its square, twice that."""
+
 _TRENDS = ("lag_sd", "gain_cv", "energy_cv", "cost_of_transport", "distance_m", "frequency_hz")
 _LEAST_JOINTS = 3
 _SAME = 1e-9  # relative: equal but for rounding
-_MOST_OUTLIERS = 50
+_MOST_UNCHANGED = 5
+"""Robots without changes that the first sentence names."""
 _MOST_ROWS = 2000  # of a mixed-effects model
 
 
@@ -46,9 +51,10 @@ class JointChange:
         earliest: Start of the last session before the 95 % interval of the change.
         latest: Start of the last session in it.
         change: Ratio minus 1 for gain and energy; rad for lag.
+        change_ci95: Its 95 % interval.
         gradual: Whether the change takes time; else it is a step.
         t: Size over its standard error. A joint that wears moves its neighbours, too, and less.
-        p: Family-wise over all joints and quantities of the robot.
+        p: Family-wise over all joints, sessions and quantities of the robot.
     """
 
     joint: str
@@ -58,6 +64,7 @@ class JointChange:
     earliest: str
     latest: str
     change: float
+    change_ci95: Interval
     gradual: bool
     t: float
     p: float
@@ -107,7 +114,7 @@ class Outlier:
 
     Attributes:
         deviation: In the unit of :attr:`JointChange.change`.
-        p: Of a normal residual, corrected by Bonferroni over all joints and sessions.
+        p: Family-wise, as that of a change.
     """
 
     path: str
@@ -119,16 +126,39 @@ class Outlier:
 
 
 @dataclass(frozen=True)
+class Memory:
+    """How much a quantity remembers from session to session, and what could be found in it.
+
+    Attributes:
+        lag_one: Lag-one correlation, pooled over the joints, without bias in the median; None if no
+            joint has enough sessions.
+        upper: Its upper 90 % limit, for which the level holds.
+        smallest_step: In the middle of the sessions, found in 9 of 10 robots; unit of
+            :attr:`JointChange.change`.
+        sessions_needed: About how many sessions show a step of :data:`SIZES`, or more than there
+            are if no joint has enough. With fewer, that nothing is found decides nothing.
+    """
+
+    quantity: str
+    lag_one: float | None
+    upper: float | None
+    smallest_step: float | None
+    sessions_needed: int
+
+
+@dataclass(frozen=True)
 class RobotHistory:
     """One robot over its sessions.
 
     Attributes:
+        serial: Serial number; empty if the sessions have none, and the name stands for one robot.
         sessions: Analysed sessions, of one set of joints.
         conditions: Sets of sessions with the same gait; joints are compared within each.
         warnings: What was left out, one sentence each.
     """
 
     robot: str
+    serial: str
     sessions: int
     joints: tuple[str, ...]
     first: str
@@ -138,7 +168,17 @@ class RobotHistory:
     trends: tuple[Trend, ...]
     components: tuple[Components, ...]
     outliers: tuple[Outlier, ...]
+    memory: tuple[Memory, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """The robot's name, with its serial number if it has one."""
+        return _label(self.robot, self.serial)
+
+
+def _label(robot: str, serial: str) -> str:
+    return f"{robot} ({serial})" if serial else robot
 
 
 @dataclass(frozen=True)
@@ -172,34 +212,68 @@ def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
     analysed = table[(table["status"] == "analysed") & table["start"].notna()]
     histories: list[RobotHistory] = []
     left_out: list[str] = []
-    for robot, own in analysed.groupby(analysed["robot"].fillna("(no name)"), sort=True):
-        history = _history(str(robot), own.sort_values("start"), joints)
-        if history is None:
-            left_out.append(f"{robot}: no {LEAST_SESSIONS} analysed sessions with the same joints")
-        else:
+    serial = analysed["serial"] if "serial" in analysed else pd.Series("", analysed.index)
+    names = [analysed["robot"].fillna("(no name)"), serial.fillna("")]
+    for (robot, number), own in analysed.groupby(names, sort=True):
+        history = _history(str(robot), str(number), own.sort_values("start"), joints)
+        if isinstance(history, RobotHistory):
             histories.append(history)
+        else:
+            name = _label(str(robot), str(number))
+            few = f"{history} of at least {LEAST_SESSIONS} analysed sessions with the same joints"
+            left_out.append(f"{name}: not decided, {few}")
+    answer = _answer(histories, left_out)
     if missing := len(sessions) - len(analysed):
         left_out.append(f"{missing} sessions are not analysed: undulog catalog --analyse")
-    return Fleet(_answer(histories), tuple(histories), tuple(left_out))
+    return Fleet(answer, tuple(histories), tuple(left_out))
 
 
-def _answer(histories: list[RobotHistory]) -> str:
+def _answer(histories: list[RobotHistory], left_out: list[str]) -> str:
     changes = [(history, change) for history in histories for change in history.changes]
     if not histories:
-        return "No robot has enough analysed sessions to compare them over time."
+        few = f" ({left_out[0]})" if left_out else ""
+        return f"No robot has enough analysed sessions to compare them over time{few}."
     if not changes:
-        n_sessions = sum(history.sessions for history in histories)
-        return f"No joint changes over {n_sessions} sessions, at a family-wise level of 1 %."
+        return " ".join(map(_unchanged, histories[:_MOST_UNCHANGED]))
     history, change = max(changes, key=lambda pair: pair[1].t)
     more = len(changes) - 1
     others = f"; {more} more change{'s' if more > 1 else ''}" if more else ""
-    return f"{history.robot}: {sentence(change)}{others}."
+    return f"{history.label}: {sentence(change)}{others}{_correlations(history)}."
+
+
+def _unchanged(history: RobotHistory) -> str:
+    """Return what is known of a robot without changes: what would show, and what is open."""
+    decided = [memory for memory in history.memory if memory.sessions_needed <= history.sessions]
+    parts: list[str] = []
+    if decided:
+        sizes = ", ".join(
+            f"{m.quantity} {_size_text(m.quantity, m.smallest_step)}" for m in decided
+        )
+        parts.append(
+            f"no joint changes over {history.sessions} sessions, where steps show ({sizes})"
+        )
+    parts += [
+        f"{m.quantity} not decided, {history.sessions} of about {m.sessions_needed} sessions"
+        for m in history.memory
+        if m not in decided
+    ]
+    return f"{history.label}: {'; '.join(parts)}{_correlations(history)}."
+
+
+def _correlations(history: RobotHistory) -> str:
+    known = [(memory.quantity, memory.lag_one) for memory in history.memory]
+    listed = ", ".join(f"{name} {rho:.2f}" for name, rho in known if rho is not None)
+    return f"; lag-one correlation of sessions: {listed}"
+
+
+def _size_text(quantity: str, value: float | None) -> str:
+    by = abs(value or 0.0)
+    return f"{math.degrees(by):.2g}°" if quantity == "lag" else f"{by * 100:.2g} %"
 
 
 def sentence(change: JointChange) -> str:
     """Return a change in words, without a full stop."""
-    by = abs(change.change)
-    size = f"{math.degrees(by):.2g}°" if change.quantity == "lag" else f"{by * 100:.2g} %"
+    size = _size_text(change.quantity, change.change)
     way = "rises" if change.change > 0 else "falls"
     gradually = ", gradually," if change.gradual else ""
     return (
@@ -208,7 +282,8 @@ def sentence(change: JointChange) -> str:
     )
 
 
-def _history(robot: str, sessions: _Frame, joints: _Frame) -> RobotHistory | None:
+def _history(robot: str, serial: str, sessions: _Frame, joints: _Frame) -> RobotHistory | int:
+    """Return the history of a robot, or the number of its sessions where they are too few."""
     own = joints[joints["path"].isin(sessions["path"])]
     tables = {
         "gain": _table(own, np.log(own["gain"].where(own["gain"] > 0))),
@@ -217,38 +292,56 @@ def _history(robot: str, sessions: _Frame, joints: _Frame) -> RobotHistory | Non
     }
     tables = {name: table for name, table in tables.items() if table is not None}
     if "gain" not in tables or len(tables["gain"]) < LEAST_SESSIONS:
-        return None
+        return len(tables.get("gain", ()))
     ordered = sessions[sessions["path"].isin(tables["gain"].index)].set_index("path")
     tables = {name: table.reindex(ordered.index) for name, table in tables.items()}
     conditions = _conditions(own, ordered)
     times_s = ordered["start"].astype("int64").to_numpy() / 1e9
-    values = {name: table.to_numpy(float) for name, table in tables.items()}
-    relative = {name: relative_to_others(one, conditions) for name, one in values.items()}
-    changes = _changes(tables, relative, ordered, times_s, conditions)
-    dropped = len(sessions) - len(ordered)
+    relative = [relative_to_others(table.to_numpy(float), conditions) for table in tables.values()]
+    judged = dict(zip(tables, find_change_points(relative, times_s, conditions), strict=True))
+    points = [
+        (name, str(tables[name].columns[point.joint]), point)
+        for name, quantity in judged.items()
+        for point in quantity.points
+    ]
+    points.sort(key=lambda named: -named[2].t)
+    left_out = (
+        [] if serial else [f"{robot}: taken as one robot by its name, without a serial number"]
+    )
+    if lacking := len(sessions) - len(ordered):
+        left_out.append(f"{lacking} sessions lack the response of most joints")
+    if partly := int(tables["gain"].isna().any(axis=1).sum()):
+        left_out.append(f"{partly} sessions lack the response of a joint")
     return RobotHistory(
         robot=robot,
+        serial=serial,
         sessions=len(ordered),
         joints=tuple(tables["gain"].columns),
         first=_date(ordered["start"].iloc[0]),
         last=_date(ordered["start"].iloc[-1]),
         conditions=len(np.unique(conditions)),
-        changes=tuple(changes),
+        changes=tuple(
+            _change(*named, ordered) for named in points if named[2].kind is not Kind.OUTLIER
+        ),
         trends=tuple(_trends(ordered)),
         components=tuple(_components(name, one, conditions) for name, one in tables.items()),
-        outliers=tuple(_outliers(tables, relative, ordered, changes, conditions)),
-        warnings=(f"{dropped} sessions lack the response of a joint",) if dropped else (),
+        outliers=tuple(
+            _outlier(*named, ordered) for named in points if named[2].kind is Kind.OUTLIER
+        ),
+        memory=tuple(_memory(name, of, len(ordered)) for name, of in judged.items()),
+        warnings=tuple(left_out),
     )
 
 
 def _table(joints: _Frame, values: _Frame) -> _Frame | None:
-    """Return values by session and joint, of the joints that most sessions have."""
+    """Return values by session and joint, of joints in most sessions, sessions with most joints."""
     latest = joints.assign(value=values).dropna(subset=["value"])
     if latest.empty:
         return None
     table = latest.pivot_table(index="path", columns="joint", values="value", aggfunc="last")
     table = table.reindex(columns=latest.groupby("joint")["position"].first().sort_values().index)
-    table = table.loc[:, table.notna().mean() >= 0.5].dropna()
+    table = table.loc[:, table.notna().mean() >= 0.5]
+    table = table[table.notna().sum(axis=1) >= max(_LEAST_JOINTS, table.shape[1] / 2)]
     return table if table.shape[1] >= _LEAST_JOINTS and len(table) else None
 
 
@@ -269,32 +362,47 @@ def _conditions(joints: _Frame, sessions: _Frame) -> IntArray:
     return np.unique(keys, return_inverse=True)[1].astype(np.int64)
 
 
-def _changes(
-    tables: Mapping[str, _Frame],
-    relative: Mapping[str, FloatArray],
-    sessions: _Frame,
-    times_s: FloatArray,
-    conditions: IntArray,
-) -> list[JointChange]:
-    found = find_change_points(list(relative.values()), times_s, conditions)
-    starts = [_date(start) for start in sessions["start"]]
-    changes = [
-        JointChange(
-            joint=str(tables[name].columns[point.joint]),
-            quantity=name,
-            since=str(sessions.index[point.session]),
-            date=starts[point.session],
-            earliest=starts[point.first - 1],
-            latest=starts[point.last],
-            change=_as_change(name, point.change),
-            gradual=point.gradual,
-            t=point.t,
-            p=point.p,
-        )
-        for name, points in zip(relative, found, strict=True)
-        for point in points
-    ]
-    return sorted(changes, key=lambda change: -change.t)
+def _change(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) -> JointChange:
+    starts = sessions["start"]
+    low, high = point.change_ci95
+    return JointChange(
+        joint=joint,
+        quantity=quantity,
+        since=str(sessions.index[point.session]),
+        date=_date(starts.iloc[point.session]),
+        earliest=_date(starts.iloc[point.first - 1]),
+        latest=_date(starts.iloc[point.last]),
+        change=_as_change(quantity, point.change),
+        change_ci95=(_as_change(quantity, low), _as_change(quantity, high)),
+        gradual=point.kind is Kind.GRADUAL,
+        t=point.t,
+        p=point.p,
+    )
+
+
+def _outlier(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) -> Outlier:
+    return Outlier(
+        path=str(sessions.index[point.session]),
+        date=_date(sessions["start"].iloc[point.session]),
+        joint=joint,
+        quantity=quantity,
+        deviation=_as_change(quantity, point.change),
+        p=point.p,
+    )
+
+
+def _memory(quantity: str, judged: Judged, sessions: int) -> Memory:
+    """Return how much a quantity remembers, and what could be found in it."""
+    if judged.noise is None:
+        return Memory(quantity, None, None, None, max(LEAST_SESSIONS, sessions + 1))
+    needed = math.ceil(sessions * (judged.smallest / SIZES[quantity]) ** 2)
+    return Memory(
+        quantity=quantity,
+        lag_one=judged.noise.rho,
+        upper=judged.noise.upper,
+        smallest_step=_as_change(quantity, judged.smallest),
+        sessions_needed=max(needed, LEAST_SESSIONS),
+    )
 
 
 def _as_change(quantity: str, value: float) -> float:
@@ -379,42 +487,3 @@ def _components(name: str, table: _Frame, conditions: IntArray) -> Components:
         joint=math.sqrt(max(0.0, variances["joint"])),
         residual=math.sqrt(fitted.scale),
     )
-
-
-def _outliers(
-    tables: Mapping[str, _Frame],
-    relative: Mapping[str, FloatArray],
-    sessions: _Frame,
-    changes: list[JointChange],
-    conditions: IntArray,
-) -> list[Outlier]:
-    """Single values far from those of their joint, which are taken apart where it changes."""
-    from scipy import stats
-
-    found: list[Outlier] = []
-    total = sum(values.size for values in relative.values())
-    positions = {str(path): k for k, path in enumerate(sessions.index)}
-    for name, values in relative.items():
-        for column, joint in enumerate(tables[name].columns):
-            apart = [positions[c.since] for c in changes if (c.joint, c.quantity) == (joint, name)]
-            after = np.searchsorted(apart, np.arange(len(values)), side="right")
-            residual = values[:, column].copy()
-            for group in set(zip(conditions.tolist(), after.tolist(), strict=True)):
-                rows = (conditions == group[0]) & (after == group[1])
-                residual[rows] -= np.nanmedian(residual[rows])
-            scale = float(stats.median_abs_deviation(residual, scale="normal", nan_policy="omit"))
-            if not scale > 0:
-                continue
-            p = np.minimum(1.0, total * 2 * stats.norm.sf(np.abs(residual) / scale))
-            found += [
-                Outlier(
-                    path=str(sessions.index[k]),
-                    date=_date(sessions["start"].iloc[k]),
-                    joint=str(joint),
-                    quantity=name,
-                    deviation=_as_change(name, float(residual[k])),
-                    p=float(p[k]),
-                )
-                for k in np.flatnonzero(p <= LEVEL)
-            ]
-    return sorted(found, key=lambda outlier: outlier.p)[:_MOST_OUTLIERS]

@@ -262,15 +262,17 @@ qualify scanned_ns = max(scanned_ns) over (partition by {source}) and not remove
 
 _SESSIONS = """
 create temp view sessions as
-select path, session_id, robot, scenario, operator, engine, verdict, software, seed, start,
-  start_ns, end_ns, duration_s, messages, size, 1 as parts, damage, topics, metadata
+select path, session_id, robot, metadata ->> '$.serial' as serial, scenario, operator, engine,
+  verdict, software, seed, start, start_ns, end_ns, duration_s, messages, size, 1 as parts,
+  damage, topics, metadata
 from files
 """
 
 _SPLIT_SESSIONS = """
 create temp view sessions as
 select head as path, first(session_id order by part) as session_id,
-  first(robot order by part) as robot, first(scenario order by part) as scenario,
+  first(robot order by part) as robot, first(metadata ->> '$.serial' order by part) as serial,
+  first(scenario order by part) as scenario,
   first(operator order by part) as operator, first(engine order by part) as engine,
   last(verdict order by part) as verdict, first(software order by part) as software,
   first(seed order by part) as seed, min(start) as start, min(start_ns) as start_ns,
@@ -308,7 +310,8 @@ from sessions left join analyses on sessions.session_id = analyses.session_id an
 
 _JOINTS = """
 create temp view joints as
-select sessions.path, sessions.robot, sessions.start, all_joints.* exclude (modified_ns, scanned_ns)
+select sessions.path, sessions.robot, sessions.serial, sessions.start,
+  all_joints.* exclude (modified_ns, scanned_ns)
 from all_joints left join sessions on sessions.session_id = all_joints.session_id and {own}
 """
 

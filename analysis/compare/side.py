@@ -98,8 +98,8 @@ _OF_THE_RUN = frozenset(
 )
 """Facts that name a run rather than describe how it was made."""
 
-_TEXTS = frozenset({"name", "description", "seed", "epoch_s", "robot"})
-"""Keys of an attached file without an effect."""
+_TEXTS = frozenset({"name", "description", "serial", "seed", "epoch_s", "robot"})
+"""Keys of an attached file without an effect, or that the metadata repeats."""
 
 _FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
 _ORDER = ("robot", *_FILES, "session")

@@ -258,7 +258,7 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
         "where": where,
         "warnings": [*fleet.warnings, *(w for h in fleet.robots for w in h.warnings)],
         "contents": [
-            (f"robot{k}", h.robot or "Robot without a name")
+            (f"robot{k}", h.label or "Robot without a name")
             for k, h in enumerate(fleet.robots, start=1)
         ],
         "command": f"undulog report --catalog {shlex.quote(where)} -o {shlex.quote(page.name)}",
@@ -329,7 +329,8 @@ def _change_drawing(
     """Draw the values of a joint that changes over its sessions, the others behind it."""
     column = {"gain": "gain", "lag": "lag_rad", "energy": "energy_abs_j"}[change.quantity]
     table: Any = joints
-    own = table[(table["robot"] == history.robot) & table["joint"].isin(history.joints)]
+    named = (table["robot"] == history.robot) & (table["serial"].fillna("") == history.serial)
+    own = table[named & table["joint"].isin(history.joints)]
     own = own.dropna(subset=[column]).sort_values("start")
     values = own[column].map(math.degrees) if change.quantity == "lag" else own[column]
     if change.quantity == "energy":

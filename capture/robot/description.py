@@ -4,6 +4,7 @@ A description has the head first::
 
     name = "two-links"
     description = "One yaw joint."
+    serial = "0007"                     # of this robot among those of its name, may be left out
     clock = "host"                      # host, device or simulated
     assumed = ["servo"]                 # parts that were assumed rather than known
     joints = [{ name = "joint01", plane = "horizontal" }]
@@ -304,6 +305,7 @@ def _parse(
     top = Table(values, "", faults)
     defaults = top.table("defaults")
     name, description = top.name("name"), top.text("description", "")
+    serial = top.text("serial", "")
     clock = top.choice("clock", ClockDomain) or ClockDomain.HOST
     assumed = top.words("assumed", valid=_PARTS)
     joints = _read_joints(top, defaults)
@@ -332,4 +334,5 @@ def _parse(
         meshes=meshes,
         assumed=assumed,
         safety=safety,
+        serial=serial,
     )

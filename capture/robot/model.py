@@ -382,6 +382,7 @@ class Robot:
         assumed: Parts of the description (``links``, ``servo``, ``bus``, ...) that were assumed
             rather than known.
         safety: How far it may be driven, or None.
+        serial: Serial number, which separates robots of one name; empty if not given.
     """
 
     name: Name
@@ -396,6 +397,7 @@ class Robot:
     meshes: tuple[tuple[str, bytes], ...] = field(default=(), repr=False)
     assumed: tuple[str, ...] = ()
     safety: Safety | None = None
+    serial: str = ""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

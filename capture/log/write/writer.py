@@ -91,6 +91,8 @@ class SessionWriter(Closing):
             "robot": robot.name if robot is not None else "",
             "undulog": own_version(),
         }
+        if robot is not None and robot.serial:
+            facts["serial"] = robot.serial
         facts |= {f"clock.{source}": domain for source, domain in (clock or {}).items()}
         facts |= dict(metadata or {})
         self.note("undulog", facts)

@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 from support import durable_child as recorder
 from support.analysed import analysed as analysed_session
 from support.bucket import s3_bucket
+from support.bus_robots import HEAD, LINK
 from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.written_sessions import joint_state, write_foreign, write_session
@@ -26,6 +27,7 @@ from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError, NotALogError, UsageError
 from undulog.capture.common.part_files import unfinished_path
 from undulog.capture.log.read.facts import MOST_REQUESTS, read_facts
+from undulog.capture.robot.description import parse_robot
 
 
 def facts_of(path, requests=None):
@@ -250,6 +252,20 @@ def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path, opened):
     ids = catalog.find().set_index("path").session_id
     assert ids["0/run.mcap"] == ids["2/run2.mcap"] != ids["1/run.mcap"]
     assert opened(tmp_path / "2/run2.mcap").session_id == ids["2/run2.mcap"]
+
+
+def test_the_serial_number_is_that_of_the_description_or_of_the_metadata(tmp_path):
+    worm = parse_robot(f'serial = "0007"{HEAD}{LINK}', "worm.toml", {})
+    assert worm.serial == "0007"
+    write_session(tmp_path / "a.mcap", robot=worm)
+    write_session(tmp_path / "b.mcap", robot=worm, metadata={"serial": "0008"})
+    write_session(tmp_path / "c.mcap")
+    catalog = Catalog(str(tmp_path))
+    catalog.scan()
+    serials = catalog.find().set_index("path").serial
+    assert serials[["a.mcap", "b.mcap"]].to_list() == ["0007", "0008"]
+    assert pd.isna(serials["c.mcap"])
+    assert len(catalog.find("serial = '0007'")) == 1
 
 
 def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(lab):

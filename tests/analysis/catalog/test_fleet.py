@@ -3,12 +3,14 @@
 import json
 from itertools import combinations
 
+import fleet_tables
 import numpy as np
 import pandas as pd
 import pytest
 
 from support.linear_chain import CHAIN, WAVE, M, write_run
-from undulog.analysis.catalog.change_points import find_change_points, relative_to_others
+from undulog.analysis.catalog.catalog import Catalog
+from undulog.analysis.catalog.change_points import Judged
 from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
 DAY_NS = 86_400_000_000_000
@@ -85,15 +87,32 @@ def without_models(monkeypatch):
     )
 
 
-def test_a_worn_joint_is_named_with_its_date(without_models):
-    sessions, rows, name, begun = frames(3, "step")
+@pytest.fixture
+def without_changes(monkeypatch):
+    """Look for no changes, which takes the rest."""
+    monkeypatch.setattr(
+        "undulog.analysis.catalog.fleet.find_change_points",
+        lambda series, *_: [Judged()] * len(series),
+    )
+
+
+@pytest.fixture
+def few_simulations(monkeypatch):
+    """Simulate a fifth of the fleets, which takes a fifth of the time."""
+    monkeypatch.setattr("undulog.analysis.catalog.change_points._SIMULATIONS", 199)
+    monkeypatch.setattr("undulog.analysis.catalog.session_noise._DRAWS", (50, 50))
+
+
+def test_a_worn_joint_is_named_with_its_date(without_models, few_simulations):
+    sessions, rows, name, begun = frames(3, "step", n=40, joints=7)
     fleet = analyse_fleet(sessions, rows)
     (change,) = fleet.robots[0].changes
     assert (change.joint, change.quantity, change.gradual) == (name, "gain", False)
     assert change.earliest <= begun.isoformat() <= change.latest
     assert change.change == pytest.approx(-0.055, abs=0.01)
     assert f"the gain of {name} falls by" in fleet.answer
-    assert begun.date().isoformat() in fleet.answer
+    assert f"from {change.date[:10]} on" in fleet.answer
+    assert "lag-one correlation of sessions: gain 0.0" in fleet.answer
 
 
 @pytest.mark.nightly
@@ -107,7 +126,7 @@ def test_variance_components_are_those_planted():
     assert robot.changes == ()
 
 
-def test_a_trend_is_that_planted(without_models):
+def test_a_trend_is_that_planted(without_models, without_changes):
     sessions, rows, _, _ = frames(8)
     days = (sessions.start - FIRST) / pd.Timedelta(days=1)
     drifting = sessions.assign(lag_sd=0.01 + 0.001 * days)
@@ -119,7 +138,7 @@ def test_a_trend_is_that_planted(without_models):
     assert low - 1e-9 <= 0.001 <= high + 1e-9
 
 
-def test_results_of_a_sweep_are_held_against_its_parameters(without_models):
+def test_results_of_a_sweep_are_held_against_its_parameters(without_models, without_changes):
     sessions, rows, _, _ = frames(3)
     torque = np.random.default_rng(0).permutation(np.geomspace(0.2, 1.0, len(sessions)))
     swept = sessions.assign(
@@ -138,8 +157,8 @@ def test_results_of_a_sweep_are_held_against_its_parameters(without_models):
     assert trends["lag_sd", "date"].p > 0.05
 
 
-def test_an_odd_session_is_an_outlier_and_no_change(without_models):
-    sessions, rows, _, _ = frames(5)
+def test_an_odd_session_is_an_outlier_and_no_change(without_models, few_simulations):
+    sessions, rows, _, _ = frames(5, n=40, joints=7)
     at = (rows.path == "run030.mcap") & (rows.joint == "joint04")
     rows.loc[at, "lag_rad"] += 0.2
     (robot,) = analyse_fleet(sessions, rows).robots
@@ -149,35 +168,52 @@ def test_an_odd_session_is_an_outlier_and_no_change(without_models):
     assert first.deviation == pytest.approx(0.2, abs=0.04)
 
 
-def test_few_or_incomplete_sessions_are_reported(without_models):
+def test_incomplete_sessions_are_reported(without_models, without_changes):
     sessions, rows, _, _ = frames(1, n=40)
-    few = analyse_fleet(sessions.head(5), rows)
-    assert few.robots == ()
-    assert "No robot has enough" in few.answer
     partly = sessions.assign(status=np.where(np.arange(40) < 4, "not analysed", "analysed"))
-    result = analyse_fleet(partly, rows[rows.path != "run020.mcap"])
+    gone = (rows.path == "run020.mcap") | ((rows.path == "run021.mcap") & (rows.position == 3))
+    result = analyse_fleet(partly, rows[~gone])
     assert result.robots[0].sessions == 35
-    assert result.robots[0].warnings == ("1 sessions lack the response of a joint",)
+    assert "1 sessions lack the response of a joint" in result.robots[0].warnings
+    assert "1 sessions lack the response of most joints" in result.robots[0].warnings
     assert "4 sessions are not analysed" in result.warnings[0]
 
 
-def test_constant_and_missing_series_have_no_change():
-    times = np.arange(20.0)
-    nothing = np.zeros(20, dtype=np.int64)
-    constant = np.ones((20, 5))
-    holes = np.random.default_rng(1).normal(size=(20, 5))
-    holes[3] = np.nan
-    assert find_change_points([constant, holes], times, nothing) == [[], []]
-    assert find_change_points([holes[:5]], times[:5], nothing[:5]) == [[]]
+def test_sessions_that_have_a_gait_of_their_own_decide_nothing(without_models, few_simulations):
+    sessions, rows, _, _ = frames(1, n=30, joints=5)
+    numbers = rows.path.str[3:6].astype(int)
+    fleet = analyse_fleet(sessions, rows.assign(frequency_hz=1.1**numbers))
+    assert "gain not decided, 30 of about 31 sessions" in fleet.answer
+    assert "no joint changes" not in fleet.answer
 
 
-def test_one_joint_does_not_move_the_others():
-    values = np.random.default_rng(2).normal(size=(40, 5)) * 0.01 + np.arange(5)
-    moved = values.copy()
-    moved[20:, 2] -= 3.0
-    nothing = np.zeros(40, dtype=np.int64)
-    before, after = (relative_to_others(one, nothing) for one in (values, moved))
-    assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
+def test_robots_of_one_name_are_separated_by_their_serial_numbers(without_models, few_simulations):
+    sessions, rows, _, _ = frames(1, n=40, joints=5)
+    odd = np.arange(40) % 2 == 1
+    other = rows.path.isin(sessions.path[odd]) & (rows.joint == "joint02")
+    rows.loc[other, "gain"] *= 0.8  # two robots that differ, recorded in turn
+    numbered = sessions.assign(serial=np.where(odd, "0002", "0001"))
+    fleet = analyse_fleet(numbered, rows)
+    assert [(robot.robot, robot.serial) for robot in fleet.robots] == [
+        ("snake13", "0001"),
+        ("snake13", "0002"),
+    ]
+    assert all(robot.changes == robot.outliers == robot.warnings == () for robot in fleet.robots)
+    assert "snake13 (0002): no joint changes over 20 sessions" in fleet.answer
+    (mixed,) = analyse_fleet(sessions, rows).robots
+    assert mixed.warnings == ("snake13: taken as one robot by its name, without a serial number",)
+
+
+def test_few_sessions_decide_nothing(without_models, few_simulations):
+    sessions, rows, _, _ = frames(1, n=40)
+    few = analyse_fleet(sessions.head(3), rows)
+    assert few.robots == ()
+    assert "not decided, 3 of at least 8 analysed sessions" in few.answer
+    noisy = rows.assign(gain=rows.gain * np.exp(np.random.default_rng(1).normal(0, 0.1, len(rows))))
+    fleet = analyse_fleet(sessions.head(12), noisy[noisy.path.isin(sessions.path.head(12))])
+    gain = next(memory for memory in fleet.robots[0].memory if memory.quantity == "gain")
+    assert gain.sessions_needed > 100
+    assert f"gain not decided, 12 of about {gain.sessions_needed} sessions" in fleet.answer
 
 
 @pytest.mark.nightly
@@ -198,7 +234,26 @@ def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
         changes = analyse_fleet(sessions, rows).robots[0].changes
         mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
         good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
-    assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]
+    assert good >= {"step": 45, "ramp": 28, "saturating": 42}[kind]
+
+
+@pytest.mark.nightly
+def test_of_fifty_folders_of_sessions_without_changes_hardly_any_has_one(tmp_path, without_models):
+    claimed = 0
+    for seed in range(50):
+        rng, case = np.random.default_rng(seed), fleet_tables.Case("", 0.3)
+        gain, lag = (0.01 * fleet_tables.noise(rng, (20, M), case) for _ in range(2))
+        folder = tmp_path / f"{seed}"
+        folder.mkdir()
+        for k, factors in enumerate(np.exp(gain - 1j * lag)):
+            answer = factors * (CHAIN @ WAVE)
+            write_run(folder / f"run{k:02d}.mcap", WAVE, answer, 20 * seed + k, 0.003)
+        lab = Catalog(str(folder))
+        lab.scan()
+        assert lab.analyse(workers=2) == {}
+        (robot,) = analyse_fleet(lab.find(), lab.find(joints=True)).robots
+        claimed += bool(robot.changes or robot.outliers)
+    assert claimed <= 3  # binomial, 1 %: 3 or fewer in 99 %
 
 
 @pytest.mark.nightly

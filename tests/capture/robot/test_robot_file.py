@@ -177,8 +177,8 @@ sum of the other two
 field_of_view (did you mean position?)
   defaults.sonar: found a table; valid: leave it out: no sensor is of kind sonar
   joints and sensors: found 2 times joint01; valid: every name once
-  clok: found an unknown key; valid: defaults, name, description, clock, assumed, chain, joints, \
-links, sensors, bus, safety, safety_of (did you mean clock?)
+  clok: found an unknown key; valid: defaults, name, description, serial, clock, assumed, chain, \
+joints, links, sensors, bus, safety, safety_of (did you mean clock?)
 """
 
 
