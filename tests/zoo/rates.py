@@ -1,0 +1,249 @@
+"""How often the first sentence is right: thousands of sessions in memory, as a table.
+
+``PYTHONPATH=tests python -m zoo.rates -o FOLDER`` draws healthy robots of every kind, plants every
+fault, and gives the recordings of real robots with and without faults to undulog. Each session is a
+row of ``FOLDER/rows.jsonl``; a run that was interrupted goes on behind the last row. At the end it
+prints a table with a bar for each line: a count within the 99 % limits of the binomial distribution
+of the stated share. Seeds are those from ``--first`` on; none is replaced.
+"""
+
+import argparse
+import json
+import sys
+import traceback
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from . import real_faults
+from .adapter import Said, stated
+from .independent_fit import independent_fit, period_of
+from .planted_faults import FAULTS, KINDS, draw, plant, record
+from .rates_table import table
+from .recordings import recordings
+from .verdicts import Verdict, judged
+
+HEALTHY, RECORDED = "healthy", "recorded"
+"""Names of rows without a fault: of a drawn robot, of a recording."""
+
+ROWS = "rows.jsonl"
+PENDING = 4
+"""Sessions a process that are handed out ahead: an interrupt loses no more than these."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One session.
+
+    Attributes:
+        fault: What is planted, or ``healthy`` or ``recorded``.
+        kind: The healthy kind, the recording, or empty where the seed chooses it.
+        seed: The seed; of a fault in a recording the joint.
+        halves: Size of the fault in half-widths of the oracle.
+    """
+
+    fault: str
+    kind: str
+    seed: int
+    halves: float = 3.0
+
+    @property
+    def key(self) -> tuple[str, str, int, float]:
+        """What tells it from all others."""
+        return self.fault, self.kind, self.seed, self.halves
+
+
+def run_task(task: Task) -> dict:
+    """Return the row of one session; of one that fails the error, which counts as wrong."""
+    row = {"fault": task.fault, "kind": task.kind, "seed": task.seed, "halves": task.halves}
+    try:
+        if task.kind in recordings():
+            return row | _recorded(task)
+        return row | (_healthy(task) if task.fault == HEALTHY else _planted(task))
+    except Exception:  # noqa: BLE001  a session that undulog fails on is a result
+        return row | {"seen": True, "error": traceback.format_exc(limit=-3), "right": False}
+
+
+def _healthy(task: Task) -> dict:
+    robot = draw(task.kind, task.seed)
+    statement = stated(record(robot, seed=task.seed))
+    verdict = judged(statement, robot.names, (), period_s=robot.motion.period_s)
+    return {
+        **_row(statement, verdict),
+        "joints": robot.m,
+        "differs": robot.differs,
+        "right": not (verdict.accusations or (verdict.alike and robot.differs))
+        and (robot.differs or not verdict.differences),
+    }
+
+
+def _planted(task: Task) -> dict:
+    only = (task.kind,) if task.kind else ()
+    robot, fault = plant(task.fault, task.seed, kinds=only, halves=task.halves)
+    if robot is None or fault is None:
+        return {"seen": False}
+    statement = stated(record(robot, fault.changes, seed=task.seed))
+    verdict = judged(
+        statement,
+        robot.names,
+        fault.joints,
+        period_s=robot.motion.period_s,
+        undecidable=fault.undecidable,
+    )
+    return {
+        **_row(statement, verdict),
+        "base": robot.kind,
+        "joints": robot.m,
+        "planted": [robot.names[joint.joint] for joint in fault.joints],
+        "since_s": fault.joints[0].since_s,
+        "size": fault.size,
+        "half": fault.half,
+        "floor": fault.floor,
+        "right": verdict.right,
+    }
+
+
+def _recorded(task: Task) -> dict:
+    """Return the row of a recording, as it is or with a fault planted in one of its joints."""
+    signals = recordings()[task.kind]()
+    if task.fault == RECORDED:
+        statement = stated(signals)
+        verdict = judged(statement, signals.names, (), period_s=1.0)
+        refuted = [a.joint for a in statement.accused if _refuted(signals, a)]
+        return {**_row(statement, verdict), "refuted": refuted, "right": not verdict.accusations}
+    if task.seed not in real_faults.exposed_joints(signals):
+        return {"seen": False}
+    fault = real_faults.FAULTS[task.fault](signals, task.seed)
+    if fault is None:
+        return {"seen": False}
+    period_s = period_of(signals.t_s, signals.commands[:, task.seed])
+    statement = stated(real_faults.faulty(signals, fault))
+    # What is said of the recording as it is, is counted there.
+    before = {a.joint for a in stated(signals).accused}
+    verdict = judged(statement, signals.names, (fault.truth,), period_s=period_s)
+    more = tuple(name for name in verdict.accusations if name not in before)
+    return {
+        **_row(statement, verdict),
+        "planted": [signals.names[task.seed]],
+        "since_s": fault.truth.since_s,
+        "accusations": more,
+        "right": verdict.joint and verdict.kind and verdict.onset and not more,
+    }
+
+
+def _refuted(signals, accused) -> bool:
+    joint = signals.names.index(accused.joint)
+    span_s = accused.since_s, accused.until_s
+    return independent_fit(*real_faults.columns(signals, joint), span_s).refutes
+
+
+def _row(statement: Said, verdict: Verdict) -> dict:
+    return {
+        "seen": True,
+        "accusations": verdict.accusations,
+        "differences": verdict.differences,
+        "alike": verdict.alike,
+        "joint": verdict.joint,
+        "kind_right": verdict.kind,
+        "onset": verdict.onset,
+        "silent": verdict.silent,
+        "kinds": {a.joint: sorted(a.kinds) for a in statement.accused},
+        "sentence": statement.sentence or statement.refused,
+    }
+
+
+def tasks(chosen: argparse.Namespace) -> Iterator[Task]:
+    """Yield the sessions of a run, seed by seed, so that an interrupted run has some of all."""
+    if chosen.recorded:
+        for name, read in recordings().items():
+            yield Task(RECORDED, name, 0)
+            joints = range(len(read().names))
+            yield from (Task(fault, name, j) for j in joints for fault in real_faults.FAULTS)
+    for seed in range(chosen.first, chosen.first + chosen.seeds):
+        yield from (Task(HEALTHY, name, seed) for name in chosen.kinds)
+        for name in chosen.faults:
+            for base in chosen.base or [""]:
+                yield Task(name, base, seed, chosen.halves)
+
+
+def stored_rows(path: Path) -> list[dict]:
+    """Return the rows that are there; one that was cut short is made again."""
+    if not path.exists():
+        return []
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            continue
+    return rows
+
+
+def run(chosen: argparse.Namespace) -> list[dict]:
+    """Run all sessions that have no row yet; return the rows of this run and of those before."""
+    path = chosen.output / ROWS
+    path.parent.mkdir(parents=True, exist_ok=True)
+    planned = list(tasks(chosen))
+    rows = {
+        Task(*(row[key] for key in ("fault", "kind", "seed", "halves"))).key: row
+        for row in stored_rows(path)
+    }
+    left = iter([task for task in planned if task.key not in rows])
+    if path.exists() and not path.read_bytes().endswith(b"\n"):
+        with path.open("a") as file:
+            file.write("\n")
+    with path.open("a") as file, ProcessPoolExecutor(chosen.jobs) as pool:
+        waiting = {
+            pool.submit(run_task, task): task for task in islice(left, PENDING * chosen.jobs)
+        }
+        while waiting:
+            done = next(as_completed(waiting))
+            task = waiting.pop(done)
+            line = json.dumps(done.result(), default=_plain)
+            rows[task.key] = json.loads(line)
+            file.write(line + "\n")
+            file.flush()
+            for more in islice(left, 1):
+                waiting[pool.submit(run_task, more)] = more
+    return [rows[task.key] for task in planned]
+
+
+def _plain(value):
+    """Return a number of NumPy as one that JSON has."""
+    return np.asarray(value).tolist()
+
+
+def parsed(arguments=None) -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    names = {"kinds": list(KINDS), "faults": list(FAULTS)}
+    for option, choices in names.items():
+        about = f"{option} to draw; all by default, none without a name"
+        parser.add_argument(
+            f"--{option}", nargs="*", default=choices, choices=choices, help=about, metavar="NAME"
+        )
+    about = "healthy kinds in which faults are planted, all faults in each; chosen by the seed"
+    parser.add_argument("--base", nargs="*", default=[], help=about, choices=list(KINDS))
+    parser.add_argument("--seeds", type=int, default=100, help="seeds of each kind and fault")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--halves", type=float, default=3.0, help="sizes in half-widths")
+    parser.add_argument("--recorded", action="store_true", help="recordings of real robots, too")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the rows")
+    return parser.parse_args(arguments)
+
+
+def main(arguments=None) -> int:
+    """Run, print the table; return 0 if every bar is met, else 1."""
+    chosen = parsed(arguments)
+    lines, is_met = table(run(chosen))
+    print("\n".join(lines))
+    return int(not is_met)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
