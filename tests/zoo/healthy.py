@@ -9,6 +9,7 @@ import numpy as np
 from .adapter import Signals
 from .disturbances import Noise, quantised, repeated
 from .motions import Motion
+from .robot import MARGIN_GAIN, MARGIN_RAD
 from .servos import Servos, respond
 
 DEGREE = np.radians(1.0)
@@ -31,8 +32,7 @@ class Healthy:
         step: Of the encoders [rad]; 0: none.
         pauses: First sample and number of samples in which the bus repeats, shape (p, 2).
         efforts: Whether the servos' efforts are logged.
-        differs: Whether its joints are unlike by more than the margins, so that it is right to
-            state differences and wrong to call them alike.
+        differs: Whether its joints were made unlike, so that it is right to state differences.
         scatter: Standard deviations of gain, lag [rad] and zero [rad] from joint to joint.
         smooth: Whether gain and lag have a profile along the chain.
     """
@@ -70,6 +70,31 @@ class Healthy:
     def moved(self):
         """Joints whose commands move, indices."""
         return np.flatnonzero(self.motion.amplitude > 0)
+
+    @property
+    def unlike(self):
+        """Whether it is wrong to call its joints alike.
+
+        Gain or lag of a moved joint, at the period of the motion, is beyond the margins about the
+        mean of all.
+        """
+        if not self.differs or self.moved.size < 2:
+            return False
+        response = self.response()
+        gain, lag = np.abs(response), np.angle(response / response.mean())
+        beyond = np.abs(gain / gain.mean() - 1) > MARGIN_GAIN
+        return bool(beyond.any() or (np.abs(lag) > MARGIN_RAD).any())
+
+    def response(self):
+        """Return response over command at the period of the motion, complex, one a moved joint.
+
+        By projection of both on a sine of that period, less their means.
+        """
+        carrier = np.exp(-2j * np.pi * self.t_s / self.motion.period_s)
+        asked, moved = self.commands()[:, self.moved], self.way[:, self.moved]
+        return ((moved - moved.mean(axis=0)).T @ carrier) / (
+            (asked - asked.mean(axis=0)).T @ carrier
+        )
 
     def commands(self):
         """Return the commands [rad], shape (n, m)."""

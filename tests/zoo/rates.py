@@ -14,13 +14,14 @@ import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from . import real_faults
-from .adapter import Said, stated
+from .adapter import Accused, Said, Signals, stated
 from .independent_fit import independent_fit, period_of
 from .planted_faults import FAULTS, KINDS, draw, plant, record
 from .rates_table import table
@@ -76,7 +77,8 @@ def _healthy(task: Task) -> dict:
         **_row(statement, verdict),
         "joints": robot.m,
         "differs": robot.differs,
-        "right": not (verdict.accusations or (verdict.alike and robot.differs))
+        "unlike": robot.unlike,
+        "right": not (verdict.accusations or (verdict.alike and robot.unlike))
         and (robot.differs or not verdict.differences),
     }
 
@@ -107,11 +109,18 @@ def _planted(task: Task) -> dict:
     }
 
 
+@lru_cache(maxsize=2)
+def _recording(name: str) -> tuple[Signals, Said]:
+    """Return a recording, and what is stated of it as it is."""
+    signals = recordings()[name]()
+    return signals, stated(signals)
+
+
 def _recorded(task: Task) -> dict:
     """Return the row of a recording, as it is or with a fault planted in one of its joints."""
-    signals = recordings()[task.kind]()
+    signals, as_it_is = _recording(task.kind)
     if task.fault == RECORDED:
-        statement = stated(signals)
+        statement = as_it_is
         verdict = judged(statement, signals.names, (), period_s=1.0)
         refuted = [a.joint for a in statement.accused if _refuted(signals, a)]
         return {**_row(statement, verdict), "refuted": refuted, "right": not verdict.accusations}
@@ -123,7 +132,7 @@ def _recorded(task: Task) -> dict:
     period_s = period_of(signals.t_s, signals.commands[:, task.seed])
     statement = stated(real_faults.faulty(signals, fault))
     # What is said of the recording as it is, is counted there.
-    before = {a.joint for a in stated(signals).accused}
+    before = {a.joint for a in as_it_is.accused}
     verdict = judged(statement, signals.names, (fault.truth,), period_s=period_s)
     more = tuple(name for name in verdict.accusations if name not in before)
     return {
@@ -135,7 +144,7 @@ def _recorded(task: Task) -> dict:
     }
 
 
-def _refuted(signals, accused) -> bool:
+def _refuted(signals: Signals, accused: Accused) -> bool:
     joint = signals.names.index(accused.joint)
     span_s = accused.since_s, accused.until_s
     return independent_fit(*real_faults.columns(signals, joint), span_s).refutes

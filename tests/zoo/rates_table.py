@@ -15,6 +15,9 @@ RIGHT = 0.95
 """Share of planted faults that are to be right: one of three half-widths of a 95 % interval is
 missed hardly ever, and the level of a statement of difference is what is left to be wrong."""
 
+HALVES = 3.0
+"""Size of a planted fault in half-widths from which it has a bar."""
+
 CONFIDENCE = 0.99
 """Of the binomial limits: a count beyond them is no chance."""
 
@@ -81,10 +84,11 @@ def _healthy_line(name: str, rows: list[dict]) -> tuple[str, bool]:
     like = [row for row in rows if not row.get("differs")]
     accused = sum(bool(row.get("accusations")) for row in rows)
     different = sum(bool(row.get("differences")) for row in like)
-    alike = sum(bool(row.get("alike")) for row in rows if row.get("differs"))
+    unlike = [row for row in rows if row.get("unlike")]
+    alike = sum(bool(row.get("alike")) for row in unlike)
     errors = sum("error" in row for row in rows)
     limits = most(ACCUSED, sessions), most(DIFFERENT, len(like))
-    wrong_alike = alike > most(DIFFERENT, sessions - len(like))
+    wrong_alike = alike > most(DIFFERENT, len(unlike))
     is_met = accused <= limits[0] and different <= limits[1] and not wrong_alike and not errors
     text = f"{name:<18} {sessions:>8}  {accused:>7} {f'({limits[0]})':>9}  "
     text += f"{different:>9} {f'({limits[1]})':>9}  {alike:>20}  {errors:>6}"
@@ -104,7 +108,9 @@ def _fault_line(name: str, rows: list[dict]) -> tuple[str, bool]:
     def count(key: str) -> int:
         return sum(bool(row.get(key)) for row in seen)
 
-    right, limit = count("right"), least(RIGHT, sessions)
+    # Smaller faults than the bar speaks of are a curve.
+    has_bar = min((row["halves"] for row in seen), default=0.0) >= HALVES
+    right, limit = count("right"), least(RIGHT, sessions) if has_bar else 0
     is_met = right >= limit
     text = f"{name:<18} {sessions:>8}  {right:>5} {f'({limit})':>10}  {count('joint'):>5} "
     text += f"{count('kind_right'):>5}  {count('onset'):>5}  {count('accusations'):>14}  "

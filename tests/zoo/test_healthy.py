@@ -1,11 +1,13 @@
 """Healthy robots of the bench: motions, servos and noise against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from zoo import motions
 from zoo.disturbances import Noise, quantised, repeated
-from zoo.healthy import DEGREE
+from zoo.healthy import DEGREE, Healthy
 from zoo.independent_fit import EXPLAINED, independent_fit
 from zoo.planted_faults import KINDS, draw, record
 from zoo.servos import alike, first_order, played, respond, stuck
@@ -70,6 +72,23 @@ def test_a_sine_answers_with_gain_delay_and_pole():
         expected = 0.9 * np.exp(-0.043j * omega) / (1 + 0.06j * omega)
         assert response == pytest.approx(expected, abs=2e-3)
         assert moved[2] == pytest.approx(motion.middle[j], abs=1e-3)
+
+
+def test_joints_are_unlike_where_gain_or_lag_is_beyond_the_margins():
+    motion = motions.gait(np.random.default_rng(1), SESSION)
+    t_s = np.arange(0, 30, 0.02)
+
+    def unlike(gain=0.0, lag=0.0):
+        delay_s = np.array([0.0, 0.0, lag]) * DEGREE * motion.period_s / (2 * np.pi)
+        servos = replace(alike(3), gain=np.array([1.0, 1.0, 1.0 + gain]), delay_s=delay_s)
+        way = respond(servos, motion, t_s)
+        return Healthy("arm", "abc", t_s, motion, servos, way, Noise(1e-3), differs=True).unlike
+
+    assert not unlike()
+    assert not unlike(gain=0.029)  # 1.9 % from the mean of three
+    assert unlike(gain=0.032)
+    assert not unlike(lag=1.4)
+    assert unlike(lag=1.6)
 
 
 def test_a_step_through_a_pole_is_an_exponential():

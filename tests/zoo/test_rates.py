@@ -66,7 +66,14 @@ def test_limits_are_those_of_the_binomial_distribution():
 
 
 def row(fault="healthy", kind="white", seed=0, **more):
-    usual = {"seen": True, "accusations": [], "differences": [], "alike": False, "right": True}
+    usual = {
+        "seen": True,
+        "halves": 3.0,
+        "accusations": [],
+        "differences": [],
+        "alike": False,
+        "right": True,
+    }
     return {"fault": fault, "kind": kind, "seed": seed, **usual, **more}
 
 
@@ -85,8 +92,10 @@ def test_the_table_marks_what_fails():
 def test_differences_of_unlike_joints_are_right_and_alike_is_wrong():
     unlike = [row(seed=k, differs=True, differences=["joint1"]) for k in range(100)]
     assert table(unlike)[1]
-    alike = [row(seed=k, differs=True, alike=True) for k in range(100)]
+    alike = [row(seed=k, differs=True, unlike=True, alike=True) for k in range(100)]
     assert not table(alike)[1]
+    within = [row(seed=k, differs=True, unlike=False, alike=True) for k in range(100)]
+    assert table(within)[1]
 
 
 def test_planted_faults_are_counted_without_those_that_could_not_be_planted():
@@ -97,6 +106,12 @@ def test_planted_faults_are_counted_without_those_that_could_not_be_planted():
     words = lines[1].split()
     assert words[:4] == ["gain", "50", "50", "(43)"]
     assert words[-1] == "10"
+
+
+def test_smaller_faults_have_no_bar():
+    rows = [row("gain", "", k, halves=2.0, right=False) for k in range(50)]
+    assert table(rows)[1]
+    assert not table([{**missed, "halves": 3.0} for missed in rows])[1]
 
 
 def chosen(folder, *words):
