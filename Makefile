@@ -98,7 +98,7 @@ clock: $(READY)  ## the tests of real time, one after the other, beside a witnes
 	@mkdir -p out/tests
 	$(PYTEST) -m clock --junitxml out/tests/clock.xml
 
-rates: $(READY)  ## how often the first sentence is right: sessions in memory, resumable (SEEDS=10 RATES="--faults")
+rates: $(READY)  ## how often the first sentence is right: sessions in memory, resumable (SEEDS=10 RATES="--recorded")
 	PYTHONPATH=tests $(BIN)/python -m zoo.rates --seeds $(or $(SEEDS),100) $(RATES) \
 	  -o out/rates/$(shell git rev-parse --short HEAD)
 

@@ -167,11 +167,13 @@ def _row(statement: Said, verdict: Verdict) -> dict:
 
 def tasks(chosen: argparse.Namespace) -> Iterator[Task]:
     """Yield the sessions of a run, seed by seed, so that an interrupted run has some of all."""
-    if chosen.recorded:
-        for name, read in recordings().items():
-            yield Task(RECORDED, name, 0)
-            joints = range(len(read().names))
-            yield from (Task(fault, name, j) for j in joints for fault in real_faults.FAULTS)
+    for name, read in recordings().items() if chosen.recorded is not None else ():
+        if chosen.recorded and name not in chosen.recorded:
+            continue
+        yield Task(RECORDED, name, 0)
+        joints = range(len(read().names))
+        names = [fault for fault in real_faults.FAULTS if fault in chosen.faults]
+        yield from (Task(fault, name, j) for j in joints for fault in names)
     for seed in range(chosen.first, chosen.first + chosen.seeds):
         yield from (Task(HEALTHY, name, seed) for name in chosen.kinds)
         for name in chosen.faults:
@@ -240,7 +242,8 @@ def parsed(arguments=None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=100, help="seeds of each kind and fault")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--halves", type=float, default=3.0, help="sizes in half-widths")
-    parser.add_argument("--recorded", action="store_true", help="recordings of real robots, too")
+    about = "recordings of real robots, too; all without a name"
+    parser.add_argument("--recorded", nargs="*", help=about, choices=list(recordings()))
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the rows")
     return parser.parse_args(arguments)

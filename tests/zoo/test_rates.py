@@ -197,7 +197,7 @@ def test_a_fault_in_a_recording_is_what_it_says(name):
         np.testing.assert_allclose(np.degrees(off), 5.0)
     if name == "gain_from":
         assert np.ptp(after[since]) / np.ptp(before[since]) == pytest.approx(0.75, abs=1e-6)
-    if name.startswith("delay"):
+    if name.startswith("lag"):
         fit = independent_fit(signals.t_s[since], before[since], after[since], (None, None))
         assert fit.delay_s == pytest.approx(0.1, abs=6e-3)
     if name == "vibration":
