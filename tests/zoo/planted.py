@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .healthy import DEGREE, KINDS, Change, Healthy, draw
+from .healthy import DEGREE, Change, Healthy, draw
 from .oracle import change_times, half_width, judged_joints
 
 STOPPED = frozenset({"jammed", "stalled", "dead", "at_limit"})
@@ -66,6 +66,23 @@ LIMIT = {"names": {"at_limit", "clipped_sensor"}, "quantities": {"gain", "offset
 
 
 @dataclass(frozen=True)
+class Least:
+    """Least size of a planted fault.
+
+    Attributes:
+        halves: In half-widths of the oracle's interval.
+        margins: In margins; at one a true change is as large as what may be called alike.
+    """
+
+    halves: float = 3.0
+    margins: float = 1.0
+
+
+USUAL = Least()
+"""The size that has a bar."""
+
+
+@dataclass(frozen=True)
 class PlantedJoint:
     """Right statements about one joint.
 
@@ -115,14 +132,14 @@ class Fault:
 
     Attributes:
         name: Its name.
-        plant: From a robot, a generator, candidate joints and the least size in half-widths to
-            what is planted; None if nothing of that size can be.
+        plant: From a robot, a generator, candidate joints and the least size to what is planted;
+            None if nothing of that size can be.
         kinds: Healthy kinds in which it is planted.
         change: Whether it begins within the record.
     """
 
     name: str
-    plant: Callable[[Healthy, np.random.Generator, list[int], float], Planted | None]
+    plant: Callable[[Healthy, np.random.Generator, list[int], Least], Planted | None]
     kinds: tuple[str, ...]
     change: bool
 
@@ -141,14 +158,14 @@ def fault(kinds, *, change=False):
     return register
 
 
-def plant(name, seed, *, kinds=(), halves=3.0):
+def plant(name, seed, *, kinds=(), least=USUAL):
     """Draw a healthy robot and plant a fault in it; the seed determines both.
 
     Args:
         name: Of the fault.
         seed: Seed.
         kinds: Healthy kinds from which is chosen; all that suit the fault if empty.
-        halves: Least size in half-widths of the oracle's interval.
+        least: Least size.
 
     Returns:
         The robot and what is planted; None twice if none of the robots drawn is asked to move
@@ -163,16 +180,10 @@ def plant(name, seed, *, kinds=(), halves=3.0):
     for attempt in range(TRIES):
         healthy = draw(base, seed * TRIES + attempt)
         joints = judged_joints(healthy, change=spec.change)
-        planted = spec.plant(healthy, rng, joints, halves) if joints else None
+        planted = spec.plant(healthy, rng, joints, least) if joints else None
         if planted is not None:
             return healthy, planted
     return None, None
-
-
-def base_kinds():
-    """Return all healthy kinds in which some fault is planted, in their order."""
-    used = {k for spec in FAULTS.values() for k in spec.kinds}
-    return [k for k in KINDS if k in used]
 
 
 def onset(healthy, rng, joint):
@@ -202,9 +213,10 @@ def single(change, names, allowed=(), *, quantities=(), sizes=(0.0, 0.0, False),
     return Planted((change,), (truth,), size, half, floor)
 
 
-def sized(half, least, halves):
-    """Return the size, half the interval, and whether the size is the least one."""
-    return max(least, halves * half), half, least > halves * half
+def sized(half, margin, least):
+    """Return the size, half the interval, and whether the size is that of the margin."""
+    sizes = least.margins * margin, least.halves * half
+    return max(sizes), half, sizes[0] > sizes[1]
 
 
 def stays(healthy, kinds, effort):
@@ -212,7 +224,8 @@ def stays(healthy, kinds, effort):
     return effort if healthy.efforts else kinds
 
 
-def resolved(healthy, joint, departure, halves, *, within):
+def resolved(healthy, joint, departure, least, *, within):
     """Whether the oracle sees a departure of size 1, and it is beyond the rest error."""
-    large = np.max(np.abs(departure)) >= max(LEAST_RAD, BEYOND_REST * healthy.rest_error(joint))
-    return bool(large) and halves * half_width(healthy, joint, departure, within=within) <= 1
+    margin = max(least.margins * LEAST_RAD, BEYOND_REST * healthy.rest_error(joint))
+    is_large = bool(np.max(np.abs(departure)) >= margin)
+    return is_large and least.halves * half_width(healthy, joint, departure, within=within) <= 1

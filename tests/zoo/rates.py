@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -23,6 +23,7 @@ import numpy as np
 from . import real_faults
 from .adapter import Accused, Said, Signals, stated
 from .independent_fit import independent_fit, period_of
+from .planted import Least
 from .planted_faults import FAULTS, KINDS, draw, plant, record
 from .rates_table import table
 from .recordings import recordings
@@ -44,23 +45,29 @@ class Task:
         fault: What is planted, or ``healthy`` or ``recorded``.
         kind: The healthy kind, the recording, or empty where the seed chooses it.
         seed: The seed; of a fault in a recording the joint.
-        halves: Size of the fault in half-widths of the oracle.
+        halves: Least size of the fault in half-widths of the oracle.
+        margins: Least size of the fault in margins.
     """
 
     fault: str
     kind: str
     seed: int
     halves: float = 3.0
+    margins: float = 1.0
 
     @property
-    def key(self) -> tuple[str, str, int, float]:
+    def key(self) -> tuple[str, str, int, float, float]:
         """What tells it from all others."""
-        return self.fault, self.kind, self.seed, self.halves
+        return self.fault, self.kind, self.seed, self.halves, self.margins
+
+
+KEYS = tuple(field.name for field in fields(Task))
+"""Keys of a row that tell its session."""
 
 
 def run_task(task: Task) -> dict:
     """Return the row of one session; of one that fails the error, which counts as wrong."""
-    row = {"fault": task.fault, "kind": task.kind, "seed": task.seed, "halves": task.halves}
+    row = asdict(task)
     try:
         if task.kind in recordings():
             return row | _recorded(task)
@@ -85,7 +92,7 @@ def _healthy(task: Task) -> dict:
 
 def _planted(task: Task) -> dict:
     only = (task.kind,) if task.kind else ()
-    robot, fault = plant(task.fault, task.seed, kinds=only, halves=task.halves)
+    robot, fault = plant(task.fault, task.seed, kinds=only, least=Least(task.halves, task.margins))
     if robot is None or fault is None:
         return {"seen": False}
     statement = stated(record(robot, fault.changes, seed=task.seed))
@@ -178,7 +185,7 @@ def tasks(chosen: argparse.Namespace) -> Iterator[Task]:
         yield from (Task(HEALTHY, name, seed) for name in chosen.kinds)
         for name in chosen.faults:
             for base in chosen.base or [""]:
-                yield Task(name, base, seed, chosen.halves)
+                yield Task(name, base, seed, chosen.halves, chosen.margins)
 
 
 def stored_rows(path: Path) -> list[dict]:
@@ -199,10 +206,7 @@ def run(chosen: argparse.Namespace) -> list[dict]:
     path = chosen.output / ROWS
     path.parent.mkdir(parents=True, exist_ok=True)
     planned = list(tasks(chosen))
-    rows = {
-        Task(*(row[key] for key in ("fault", "kind", "seed", "halves"))).key: row
-        for row in stored_rows(path)
-    }
+    rows = {Task(**{key: row[key] for key in KEYS}).key: row for row in stored_rows(path)}
     left = iter([task for task in planned if task.key not in rows])
     if path.exists() and not path.read_bytes().endswith(b"\n"):
         with path.open("a") as file:
@@ -241,8 +245,9 @@ def parsed(arguments=None) -> argparse.Namespace:
     parser.add_argument("--base", nargs="*", default=[], help=about, choices=list(KINDS))
     parser.add_argument("--seeds", type=int, default=100, help="seeds of each kind and fault")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--halves", type=float, default=3.0, help="sizes in half-widths")
+    parser.add_argument("--halves", type=float, default=3.0, help="least sizes in half-widths")
     about = "recordings of real robots, too; all without a name"
+    parser.add_argument("--margins", type=float, default=1.0, help="least sizes in margins")
     parser.add_argument("--recorded", nargs="*", help=about, choices=list(recordings()))
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the rows")

@@ -177,7 +177,7 @@ def test_encoders_count_in_steps_and_pauses_repeat():
     np.testing.assert_array_equal(paused, [0, 1, 2, 2, 2, 5, 6, 6, 8, 9])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_twin_is_healthy():
     robot = draw("twin", 1)
     assert robot.moved.size == 13

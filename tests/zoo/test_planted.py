@@ -5,7 +5,7 @@ import pytest
 
 from zoo.healthy import DEGREE
 from zoo.oracle import exposed, half_width, needed_s
-from zoo.planted import ANY, LEAST_GAIN, hold
+from zoo.planted import ANY, LEAST_GAIN, Least, hold
 from zoo.planted_faults import FAULTS, KINDS, draw, plant, record
 
 BASE = ("white", "quantised_encoder", "delayed", "short_chain", "many_joints")
@@ -59,14 +59,14 @@ def test_a_fault_has_time_to_be_seen(name):
             assert (when & ~before).sum() * healthy.step_s >= needed - 2 * healthy.step_s
 
 
-@pytest.mark.parametrize("halves", [2.0, 3.0])
-def test_a_gain_is_as_large_as_the_oracle_wants_it(halves):
-    healthy, fault = planted("gain", 2, halves=halves)
+@pytest.mark.parametrize("least", [Least(2.0), Least(3.0), Least(3.0, 1.5)])
+def test_a_gain_is_as_large_as_the_oracle_wants_it(least):
+    healthy, fault = planted("gain", 2, least=least)
     (truth,) = fault.joints
     way = healthy.way[:, truth.joint] - healthy.middle[truth.joint]
     moved = fault.changes[0].position - healthy.middle[truth.joint]
     assert moved == pytest.approx((1 + truth.sign * fault.size) * way)
-    assert fault.size == pytest.approx(max(LEAST_GAIN, halves * fault.half))
+    assert fault.size == pytest.approx(max(least.margins * LEAST_GAIN, least.halves * fault.half))
     rate = np.gradient(way, healthy.t_s)
     alone = half_width(healthy, truth.joint, way, nuisance=[rate])
     assert fault.half == pytest.approx(np.hypot(alone, 3.5 * healthy.scatter[0]))
