@@ -22,6 +22,8 @@ from undulog.capture.log.columns.topics import Channel
 from undulog.capture.log.read.facts import TIMES_FROM_FPS
 from undulog.capture.log.read.joint_topics import JointTopics
 from undulog.capture.log.read.sample_times import JointSignals
+from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import Robot
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Time of the first sample [Unix ns]: any will do; that of the bags of the zoo."""
@@ -29,6 +31,23 @@ EPOCH_NS = 1_700_000_000_000_000_000
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 FIELDS = ("position", "velocity", "effort")
 UNITS = MappingProxyType({"position": "rad", "velocity": "rad/s", "effort": "N m"})
+
+DESCRIPTION = """
+name = "drawn"
+description = "A robot that was drawn; what it is made of is assumed."
+clock = "host"
+assumed = ["links", "servo", "joints"]
+joints = [{joints}]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+[defaults.joint]
+lower = -3.2
+upper = 3.2
+"""
+"""A robot description with the joints left open."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +122,22 @@ class Signals:
     commands: np.ndarray
     positions: np.ndarray
     efforts: np.ndarray | None = None
-    description: object | None = None
+    description: Robot | None = None
     frame_rate_hz: float = 0.0
+
+
+def described(names: Sequence[str], planes: Sequence[str]) -> Robot:
+    """Return the description of a robot: its joints with their planes, and nothing certain else.
+
+    Args:
+        names: Of the joints, head to tail.
+        planes: ``horizontal`` or ``vertical`` of each of them.
+    """
+    joints = ", ".join(
+        f'{{ name = "{name}", plane = "{plane}" }}'
+        for name, plane in zip(names, planes, strict=True)
+    )
+    return parse_robot(DESCRIPTION.format(joints=joints), "drawn.toml", {})
 
 
 def stated(signals: Signals) -> Said:

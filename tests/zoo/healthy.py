@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .adapter import Signals
+from .adapter import Signals, described
 from .disturbances import Noise, quantised, repeated
 from .motions import Motion
 from .robot import MARGIN_GAIN, MARGIN_RAD
@@ -34,6 +34,7 @@ class Healthy:
         efforts: Whether the servos' efforts are logged.
         differs: Whether its joints were made unlike, so that it is right to state differences.
         scatter: Standard deviations of gain, lag [rad] and zero [rad] from joint to joint.
+        planes: Plane of each joint by the robot's description; empty without a description.
         smooth: Whether gain and lag have a profile along the chain.
     """
 
@@ -49,6 +50,7 @@ class Healthy:
     efforts: bool = False
     differs: bool = False
     scatter: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    planes: tuple[str, ...] = ()
     smooth: bool = False
 
     @property
@@ -159,7 +161,8 @@ def record(healthy, changes=(), seed=0):
         efforts += 0.01 * STIFFNESS * np.max(healthy.motion.amplitude) * rounding
         efforts = repeated(efforts, healthy.pauses)
     positions = repeated(positions, healthy.pauses)
-    return Signals(healthy.names, healthy.t_s, commands, positions, efforts)
+    robot = described(healthy.names, healthy.planes) if healthy.planes else None
+    return Signals(healthy.names, healthy.t_s, commands, positions, efforts, robot)
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Healthy]] = {}

@@ -364,14 +364,23 @@ def multisine(rng):
     return _usual("multisine", rng, motion=motions.multisine, drawn=_drawn(rng, least_s=20.0))
 
 
+def _in_turn(rng, drawn):
+    """Return a gait in two planes, joint by joint."""
+    return motions.gait(rng, drawn, by_plane=np.arange(drawn.m) % 2)
+
+
 @kind
 def planes(rng):
-    """Joints that bend the body in two planes in turn."""
+    """Joints that bend the body in two planes in turn; nothing describes them."""
+    return _usual("planes", rng, motion=_in_turn, drawn=_drawn(rng, (6, 60)))
 
-    def motion(rng, drawn):
-        return motions.gait(rng, drawn, by_plane=np.arange(drawn.m) % 2)
 
-    return _usual("planes", rng, motion=motion, drawn=_drawn(rng, (6, 60)))
+@kind
+def described_planes(rng):
+    """The same with a description of the robot, which names each joint's plane."""
+    drawn = _drawn(rng, (8, 60))
+    by_joint = tuple(("horizontal", "vertical")[j % 2] for j in range(drawn.m))
+    return _usual("described_planes", rng, motion=_in_turn, drawn=drawn, planes=by_joint)
 
 
 @kind

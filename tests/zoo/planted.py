@@ -38,7 +38,16 @@ MOST = 3.0
 """Largest planted change of a gain: a larger one is another fault (a wrong unit)."""
 
 PERIODIC = ("white", "ar90", "ar98", "student", "multiplicative", "shared", "quantised_encoder")
-PERIODIC += ("stick", "backlash", "delayed", "wander", "planes", "efforts", "one_command")
+PERIODIC += (
+    "stick",
+    "backlash",
+    "delayed",
+    "wander",
+    "planes",
+    "described_planes",
+    "efforts",
+    "one_command",
+)
 """Kinds whose joints are alike and repeat one motion."""
 
 LIKE = (*PERIODIC, "many_joints", "short_chain", "chirp", "multisine", "some_move")

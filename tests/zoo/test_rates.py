@@ -12,6 +12,7 @@ from undulog.capture.common.errors import DataError
 from zoo import adapter, rates, real_faults
 from zoo.adapter import Accused, Said, Signals, stated
 from zoo.independent_fit import independent_fit
+from zoo.planted_faults import draw, record
 from zoo.rates_table import least, most, table
 from zoo.recordings import recordings
 
@@ -46,6 +47,15 @@ def test_a_session_in_memory_states_what_its_file_states(tmp_path, opened, case)
     assert statement.alike == bool(answer.alike)
     if case == "jammed":
         assert statement.accused[0].joint == "joint3"
+
+
+def test_a_description_gives_the_planes_of_the_joints():
+    robot = draw("described_planes", 1)
+    signals = record(robot, seed=1)
+    planes = [str(joint.plane) for joint in signals.description.joints]
+    assert planes[:3] == ["horizontal", "vertical", "horizontal"]
+    assert signals.description.joint_names == robot.names
+    assert stated(signals).sentence
 
 
 def test_a_session_that_is_refused_says_why(monkeypatch):
