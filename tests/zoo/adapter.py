@@ -89,6 +89,7 @@ class Said:
     Attributes:
         accused: Joints that don't follow, or have a fault.
         different: Joints that respond differently.
+        shaped: Whether a shape along the joints is stated, or that all of them differ.
         alike: Whether all joints are stated to be alike.
         not_decided: Whether the sentence leaves open whether or which joints differ.
         sentence: The sentence itself.
@@ -97,6 +98,7 @@ class Said:
 
     accused: tuple[Accused, ...]
     different: tuple[Different, ...]
+    shaped: bool
     alike: bool
     not_decided: bool
     sentence: str
@@ -146,7 +148,7 @@ def stated(signals: Signals) -> Said:
         session = cast("SessionView", MemorySession(signals))
         measured = measure_session(session, with_dead_bands=False, with_body=False)
     except UndulogError as error:
-        return Said((), (), alike=False, not_decided=True, sentence="", refused=str(error))
+        return Said((), (), False, False, True, sentence="", refused=str(error))
     answer = measured.analysis.answer
     accused = tuple(
         Accused(fault.joint, frozenset(fault.kinds), fault.since_s, fault.until_s)
@@ -157,7 +159,14 @@ def stated(signals: Signals) -> Said:
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
     not_decided = answer.undecided is not None or answer.verdict in open_verdicts
-    return Said(accused, different, bool(answer.alike), not_decided, answer.sentence)
+    return Said(
+        accused,
+        different,
+        shaped=bool(answer.shape),
+        alike=bool(answer.alike),
+        not_decided=not_decided,
+        sentence=answer.sentence,
+    )
 
 
 class MemorySession:

@@ -86,7 +86,7 @@ def _healthy(task: Task) -> dict:
         "differs": robot.differs,
         "unlike": robot.unlike,
         "right": not (verdict.accusations or (verdict.alike and robot.unlike))
-        and (robot.differs or not verdict.differences),
+        and (robot.differs or not (verdict.differences or verdict.shaped)),
     }
 
 
@@ -162,6 +162,7 @@ def _row(statement: Said, verdict: Verdict) -> dict:
         "seen": True,
         "accusations": verdict.accusations,
         "differences": verdict.differences,
+        "shaped": verdict.shaped,
         "alike": verdict.alike,
         "joint": verdict.joint,
         "kind_right": verdict.kind,

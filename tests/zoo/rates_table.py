@@ -8,8 +8,8 @@ ACCUSED = 0.01
 """Share of healthy sessions in which a joint may be accused."""
 
 DIFFERENT = 0.05
-"""Share of healthy sessions in which a joint may be stated to differ, or unlike joints to be alike:
-the level of the intervals and of the equivalence tests."""
+"""Share of sessions of like joints in which some may be stated to differ, and of unlike ones that
+may be stated to be alike: the level of the intervals and of the equivalence tests."""
 
 RIGHT = 0.95
 """Share of planted faults that are to be right: one of three half-widths of a 95 % interval is
@@ -83,7 +83,7 @@ def _healthy_line(name: str, rows: list[dict]) -> tuple[str, bool]:
     sessions = len(rows)
     like = [row for row in rows if not row.get("differs")]
     accused = sum(bool(row.get("accusations")) for row in rows)
-    different = sum(bool(row.get("differences")) for row in like)
+    different = sum(bool(row.get("differences") or row.get("shaped")) for row in like)
     unlike = [row for row in rows if row.get("unlike")]
     alike = sum(bool(row.get("alike")) for row in unlike)
     errors = sum("error" in row for row in rows)

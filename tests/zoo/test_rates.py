@@ -16,7 +16,7 @@ from zoo.planted_faults import draw, record
 from zoo.rates_table import least, most, table
 from zoo.recordings import recordings
 
-NOTHING = Said((), (), alike=False, not_decided=True, sentence="")
+NOTHING = Said((), (), shaped=False, alike=False, not_decided=True, sentence="")
 
 
 def arrays(m=5, seed=1, rate_hz=50, seconds=20):
@@ -100,7 +100,9 @@ def test_the_table_marks_what_fails():
 
 
 def test_differences_of_unlike_joints_are_right_and_alike_is_wrong():
-    unlike = [row(seed=k, differs=True, differences=["joint1"]) for k in range(100)]
+    shaped = [row(seed=k, shaped=True) for k in range(100)]
+    assert not table(shaped)[1]
+    unlike = [row(seed=k, differs=True, shaped=True, differences=["joint1"]) for k in range(100)]
     assert table(unlike)[1]
     alike = [row(seed=k, differs=True, unlike=True, alike=True) for k in range(100)]
     assert not table(alike)[1]

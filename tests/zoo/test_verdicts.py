@@ -13,10 +13,11 @@ WEAK = PlantedJoint(
 )
 
 
-def said(*accused, different=(), alike=False, not_decided=False, sentence=None):
+def said(*accused, different=(), sentence=None, **more):
     names = [a.joint for a in accused] + [d.joint for d in different]
     text = " ".join(names) if sentence is None else sentence
-    return Said(tuple(accused), tuple(different), alike, not_decided, text)
+    usual = {"shaped": False, "alike": False, "not_decided": False} | more
+    return Said(tuple(accused), tuple(different), sentence=text, **usual)
 
 
 def accused(joint="a2", kinds=("jammed", "dead"), since_s=10.4):
@@ -93,3 +94,5 @@ def test_a_healthy_robot():
     verdict = judge(said(accused(), different=[Different("a1", "lag", 0.1, None)]))
     assert verdict.accusations == ("a2",)
     assert verdict.differences == ("a1",)
+    assert not verdict.shaped
+    assert judge(said(shaped=True)).shaped

@@ -1,7 +1,7 @@
 """Right or wrong: what a session states against what was planted in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .adapter import Said
 from .judging import MOST_NAMED, named_in
@@ -14,11 +14,12 @@ cycle by cycle is off by a cycle and a half at most (``judging`` holds the zoo t
 
 @dataclass(frozen=True)
 class Verdict:
-    """A judged statement; of a healthy robot all but the first three are as good as unused.
+    """A judged statement; of a healthy robot all but the first four are as good as unused.
 
     Attributes:
         accusations: Joints accused in which nothing was planted.
         differences: Joints stated to differ in which nothing was planted.
+        shaped: Whether a shape along the joints is stated.
         alike: Whether all are stated to be alike.
         joint: Whether all planted joints are named.
         kind: Whether all their kinds or quantities are right.
@@ -28,6 +29,7 @@ class Verdict:
 
     accusations: tuple[str, ...]
     differences: tuple[str, ...]
+    shaped: bool
     alike: bool
     joint: bool = True
     kind: bool = True
@@ -61,25 +63,24 @@ def judged(
     accused = tuple(a.joint for a in statement.accused if a.joint not in planted)
     different = dict.fromkeys(d.joint for d in statement.different if d.joint not in planted)
     stated = {a.joint for a in statement.accused} | {d.joint for d in statement.different}
-    verdict = Verdict(accused, tuple(different), statement.alike, silent=not stated)
+    verdict = Verdict(
+        accused, tuple(different), statement.shaped, statement.alike, silent=not stated
+    )
     if not planted:
         return verdict
     if undecidable and statement.not_decided and not stated:
-        return Verdict(accused, tuple(different), statement.alike)
+        return replace(verdict, silent=False)
     in_sentence = named_in(statement.sentence, names)
     expected = min(len(planted), MOST_NAMED)
     is_named = planted.keys() <= stated
     is_named &= len([name for name in in_sentence if name in planted]) >= expected
-    return Verdict(
-        accused,
-        tuple(different),
-        statement.alike,
+    return replace(
+        verdict,
         joint=is_named,
         kind=all(_kind_is_right(statement, name, joint) for name, joint in planted.items()),
         onset=all(
             _onset_is_right(statement, name, joint, period_s) for name, joint in planted.items()
         ),
-        silent=not stated,
     )
 
 
