@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -27,12 +27,16 @@ from .planted import Least
 from .planted_faults import FAULTS, KINDS, draw, plant, record
 from .rates_table import table
 from .recordings import recordings
-from .verdicts import Verdict, judged
+from .verdicts import SECONDS, Verdict, judged
 
 HEALTHY, RECORDED = "healthy", "recorded"
 """Names of rows without a fault: of a drawn robot, of a recording."""
 
 ROWS = "rows.jsonl"
+LONGEST_PERIOD_S = 4.0
+"""Period of a recorded motion at most, where an onset is judged [s]: what repeats within a minute
+or not at all gives no longer time to find an onset. The recorded gaits have periods up to 4 s."""
+
 PENDING = 4
 """Sessions a process that are handed out ahead: an interrupt loses no more than these."""
 
@@ -136,11 +140,13 @@ def _recorded(task: Task) -> dict:
     fault = real_faults.FAULTS[task.fault](signals, task.seed)
     if fault is None:
         return {"seen": False}
-    period_s = period_of(signals.t_s, signals.commands[:, task.seed])
+    period_s = min(period_of(signals.t_s, signals.commands[:, task.seed]), LONGEST_PERIOD_S)
     statement = stated(real_faults.faulty(signals, fault))
-    # What is said of the recording as it is, is counted there.
+    # What is stated of the recording as it is, is counted there, and is no answer to the fault.
     before = {a.joint for a in as_it_is.accused}
-    verdict = judged(statement, signals.names, (fault.truth,), period_s=period_s)
+    fresh = tuple(a for a in statement.accused if not any(_same(a, b) for b in as_it_is.accused))
+    fresh_statement = replace(statement, accused=fresh)
+    verdict = judged(fresh_statement, signals.names, (fault.truth,), period_s=period_s)
     more = tuple(name for name in verdict.accusations if name not in before)
     return {
         **_row(statement, verdict),
@@ -149,6 +155,13 @@ def _recorded(task: Task) -> dict:
         "accusations": more,
         "right": verdict.joint and verdict.kind and verdict.onset and not more,
     }
+
+
+def _same(accused: Accused, before: Accused) -> bool:
+    """Whether an accusation is as it was without the fault, within the slack of an onset."""
+    apart_s = abs((accused.since_s or 0.0) - (before.since_s or 0.0))
+    same = (accused.joint, accused.kinds) == (before.joint, before.kinds)
+    return same and apart_s <= SECONDS
 
 
 def _refuted(signals: Signals, accused: Accused) -> bool:

@@ -230,6 +230,21 @@ def test_an_accusation_of_a_joint_that_follows_is_refuted():
     assert not rates._refuted(still, accused)
 
 
+def test_what_is_stated_without_the_fault_is_no_answer_to_it(monkeypatch):
+    """A joint that is accused as before isn't found; another accusation of it is."""
+    signals = gait_signals()
+    before = Accused("joint2", frozenset({"slipped"}), 20.0, None)
+    usual = {"shaped": False, "alike": False, "not_decided": False, "sentence": "joint2 joint3"}
+    as_it_is = Said((before,), (), **usual)
+    monkeypatch.setattr(rates, "_recording", lambda name: (signals, as_it_is))
+    right = {}
+    for since_s in (20.2, 16.0):
+        accused = Accused("joint2", frozenset({"slipped"}), since_s, None)
+        monkeypatch.setattr(rates, "stated", lambda _, a=accused: Said((a,), (), **usual))
+        right[since_s] = rates._recorded(rates.Task("offset_from", "kuka", 1))["right"]
+    assert right == {20.2: False, 16.0: True}
+
+
 needs_recordings = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recordings in {SHARED}")
 
 
