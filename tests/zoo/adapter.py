@@ -32,6 +32,9 @@ COMMANDS, STATES = "/joint_commands", "/joint_states"
 FIELDS = ("position", "velocity", "effort")
 UNITS = MappingProxyType({"position": "rad", "velocity": "rad/s", "effort": "N m"})
 
+SHAPED = ("do not move alike", "The others differ")
+"""Words of a sentence that states a shape; shapes within the margins are in the lists alone."""
+
 DESCRIPTION = """
 name = "drawn"
 description = "A robot that was drawn; what it is made of is assumed."
@@ -162,7 +165,7 @@ def stated(signals: Signals) -> Said:
     return Said(
         accused,
         different,
-        shaped=bool(answer.shape),
+        shaped=any(words in answer.sentence for words in SHAPED),
         alike=bool(answer.alike),
         not_decided=not_decided,
         sentence=answer.sentence,

@@ -45,8 +45,17 @@ def test_a_session_in_memory_states_what_its_file_states(tmp_path, opened, case)
     assert [a.joint for a in statement.accused] == [f.joint for f in answer.not_following]
     assert [d.joint for d in statement.different] == [d.joint for d in answer.stand_out]
     assert statement.alike == bool(answer.alike)
+    assert not statement.shaped
     if case == "jammed":
         assert statement.accused[0].joint == "joint3"
+
+
+def test_a_shape_counts_where_the_sentence_states_it():
+    names, t_s, commands, positions = arrays(9)
+    positions *= 1 - 0.08 * np.arange(9) / 8
+    statement = stated(Signals(names, t_s, commands, positions))
+    assert statement.shaped
+    assert not statement.alike
 
 
 def test_a_description_gives_the_planes_of_the_joints():
