@@ -19,8 +19,9 @@ PER_PERIOD = 12
 """Samples a period at least: six times the two of the sampling theorem, so that a servo's answer
 between two samples is nearly straight."""
 
-SHORTEST_CYCLES = 6.0
-"""Cycles that a drawn gait has at least: three on both sides of a change in its middle."""
+SHORTEST_CYCLES = 8.0
+"""Cycles that a drawn gait has at least: with fewer than eight blocks nothing is to be claimed from
+a comparison."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ LEVEL = 0.05
 QUANTITIES = 3
 """Of a joint: gain, lag and offset."""
 
+COMPARABLE = 4
+"""Moved joints from which one can be told from the others."""
+
 CYCLES = 3.0
 """Exposed cycles on both sides of a change, at least."""
 
@@ -66,13 +69,14 @@ def compared_variance(healthy, joint, *, within):
     """Return the variance of a comparison, in variances of the joint itself.
 
     Beside its own there is that of what the other moved joints predict: of their mean, or of a
-    smooth profile through them.
+    smooth profile through them; with too few of them nothing is told from a comparison.
     """
     moved = healthy.moved
-    if moved.size < 2:
-        return 1.0 if within else np.inf
-    place = int(np.searchsorted(moved, joint))
-    return 1 + (1 / (moved.size - 1) if within else leverage(moved.size, place))
+    if within:
+        return 1 + 1 / max(moved.size - 1, 1)
+    if moved.size < COMPARABLE:
+        return np.inf
+    return 1 + leverage(moved.size, int(np.searchsorted(moved, joint)))
 
 
 def exposed(healthy, joint):

@@ -37,6 +37,10 @@ TRIES = 40
 MOST = 3.0
 """Largest planted change of a gain: a larger one is another fault (a wrong unit)."""
 
+SCATTERS = 3.5
+"""Standard deviations from joint to joint that count as half an interval, since a joint is compared
+with how sound ones scatter, too: one of 60 normal values is beyond in 3 % of the chains."""
+
 PERIODIC = ("white", "ar90", "ar98", "student", "multiplicative", "shared", "quantised_encoder")
 PERIODIC += (
     "stick",

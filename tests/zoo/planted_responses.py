@@ -13,6 +13,7 @@ from .planted import (
     LEAST_RAD,
     LIKE,
     MOST,
+    SCATTERS,
     ZERO,
     Planted,
     PlantedJoint,
@@ -29,7 +30,7 @@ def _gain_size(healthy, j, acts, least, *, within):
     nuisance = [way, rate] if within else [rate]
     half = half_width(healthy, j, way * acts, within=within, nuisance=nuisance)
     if not within:
-        half = float(np.hypot(half, 3.5 * healthy.scatter[0]))
+        half = float(np.hypot(half, SCATTERS * healthy.scatter[0]))
     sizes = sized(half, LEAST_GAIN, least)
     return sizes if sizes[0] <= MOST else None
 
@@ -69,7 +70,7 @@ def _late(healthy, j, acts, least, *, within):
     half = half_width(healthy, j, -rate * acts, within=within, nuisance=nuisance)
     angular = 2 * np.pi / healthy.motion.period_s
     if not within:
-        half = float(np.hypot(half, 3.5 * healthy.scatter[1] / angular))
+        half = float(np.hypot(half, SCATTERS * healthy.scatter[1] / angular))
     sizes = sized(half, LEAST_RAD / angular, least)
     if sizes[0] > healthy.motion.period_s / 4:
         return None
@@ -98,8 +99,8 @@ def _offset(healthy, j, acts, least, *, within):
     way, rate = way_and_rate(healthy, j)
     half = half_width(healthy, j, 1.0 * acts, within=within, nuisance=[way, rate])
     if not within:
-        half = float(np.hypot(half, 3.5 * healthy.scatter[2]))
-    return sized(half, LEAST_RAD, least)
+        half = float(np.hypot(half, SCATTERS * healthy.scatter[2]))
+    return sized(half, LEAST_RAD, least) if np.isfinite(half) else None
 
 
 @fault(LIKE)
@@ -107,7 +108,8 @@ def offset(healthy, rng, joints, least):
     """The joint's zero is off throughout."""
     j, sign = int(rng.choice(joints)), float(rng.choice([-1, 1]))
     acts = np.ones(healthy.t_s.size)
-    sizes = _offset(healthy, j, acts, least, within=False)
+    if (sizes := _offset(healthy, j, acts, least, within=False)) is None:
+        return None
     change = Change(j, position=healthy.way[:, j] + sign * sizes[0])
     return single(change, **ZERO, sizes=sizes, sign=sign)
 

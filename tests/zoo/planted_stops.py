@@ -21,7 +21,7 @@ from .planted import (
 
 def _standing(healthy, joint, position, acts, least, **truth):
     departure = position - healthy.way[:, joint]
-    if not resolved(healthy, joint, departure, least, within=False):
+    if not resolved(healthy, joint, departure, least, within=True):
         return None
     power = np.where(acts, 0.0, 1.0) if truth.pop("powerless", False) else 1.0
     return single(Change(joint, position=position, power=power), **truth)
@@ -77,7 +77,7 @@ def frozen(healthy, rng, joints, least):
     j = int(rng.choice(joints))
     since, acts = onset(healthy, rng, j)
     departure = hold(healthy.way[:, j], acts) - healthy.way[:, j]
-    if not resolved(healthy, j, departure, least, within=False):
+    if not resolved(healthy, j, departure, least, within=True):
         return None
     change = Change(j, reading=lambda read: hold(read, acts))
     allowed = stays(healthy, STOPPED | REPEATS, LOADED | REPEATS)
@@ -110,6 +110,6 @@ def inverted(healthy, rng, joints, least):
     """The joint moves against its command."""
     j = int(rng.choice(joints))
     position = 2 * healthy.middle[j] - healthy.way[:, j]
-    if not resolved(healthy, j, position - healthy.way[:, j], least, within=False):
+    if not resolved(healthy, j, position - healthy.way[:, j], least, within=True):
         return None
     return single(Change(j, position=position), {"inverted", "inverted_sensor"})

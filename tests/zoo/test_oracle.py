@@ -75,6 +75,15 @@ def test_half_widths_are_those_of_drawn_noise():
     assert half_width(robot, 4, way) == pytest.approx(expected, rel=0.1)
 
 
+def test_with_three_joints_nothing_is_told_from_a_comparison():
+    robot = robot_with(Noise(0.004))
+    moves = np.arange(M) < 3
+    few = replace(robot, motion=motions.partly(robot.motion, moves))
+    way, acts = robot.way[:, 1], robot.t_s >= DURATION / 2
+    assert half_width(few, 1, way) == np.inf
+    assert half_width(few, 1, way * acts, within=True) < 0.1
+
+
 def test_what_joints_share_cancels_and_proportional_noise_counts_where_it_is():
     alone, shared = (robot_with(Noise(0.004, shared=share)) for share in (0.0, 0.75))
     way = alone.way[:, 4]

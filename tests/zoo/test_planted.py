@@ -5,7 +5,7 @@ import pytest
 
 from zoo.healthy import DEGREE
 from zoo.oracle import exposed, half_width, needed_s
-from zoo.planted import ANY, LEAST_GAIN, Least, hold
+from zoo.planted import ANY, LEAST_GAIN, SCATTERS, Least, hold
 from zoo.planted_faults import FAULTS, KINDS, draw, plant, record
 
 BASE = ("white", "quantised_encoder", "delayed", "short_chain", "many_joints")
@@ -69,7 +69,7 @@ def test_a_gain_is_as_large_as_the_oracle_wants_it(least):
     assert fault.size == pytest.approx(max(least.margins * LEAST_GAIN, least.halves * fault.half))
     rate = np.gradient(way, healthy.t_s)
     alone = half_width(healthy, truth.joint, way, nuisance=[rate])
-    assert fault.half == pytest.approx(np.hypot(alone, 3.5 * healthy.scatter[0]))
+    assert fault.half == pytest.approx(np.hypot(alone, SCATTERS * healthy.scatter[0]))
 
 
 def test_a_lag_is_a_delay():
