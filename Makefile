@@ -16,7 +16,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow night clock zoo campaign mutants delays study check format bench docs schemas pictures pages \
+.PHONY: help demo test slow night clock zoo rates campaign mutants delays study check format bench docs schemas pictures pages \
   pages-scripts pages-tables nightly golden lock release install-paths clean
 
 help:  ## this list
@@ -97,6 +97,10 @@ night: $(READY)  ## the tests that draw, simulate or repeat for long; golden pic
 clock: $(READY)  ## the tests of real time, one after the other, beside a witness of how late it is
 	@mkdir -p out/tests
 	$(PYTEST) -m clock --junitxml out/tests/clock.xml
+
+rates: $(READY)  ## how often the first sentence is right: sessions in memory, resumable (SEEDS=10 RATES="--recorded")
+	PYTHONPATH=tests $(BIN)/python -m zoo.rates --seeds $(or $(SEEDS),100) $(RATES) \
+	  -o out/rates/$(shell git rev-parse --short HEAD)
 
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
