@@ -74,8 +74,9 @@ class Different:
     """A joint that a sentence states to respond differently from the others.
 
     Attributes:
-        quantity: ``gain``, ``lag`` or ``offset``.
-        value: Relative for a gain, rad for the others.
+        quantity: ``gain``, ``lag``, ``offset``, ``noise``, or ``motion`` at a frequency that isn't
+            the command's.
+        value: Relative for a gain, a ratio for noise, rad or s for the others.
         onset_s: Start [s]; None: no onset is stated.
     """
 
@@ -157,8 +158,10 @@ def stated(signals: Signals) -> Said:
         Accused(fault.joint, frozenset(fault.kinds), fault.since_s, fault.until_s)
         for fault in answer.not_following
     )
-    different = tuple(
-        Different(joint.joint, joint.quantity, joint.deviation, None) for joint in answer.stand_out
+    different = (
+        *(Different(one.joint, one.quantity, one.deviation, None) for one in answer.stand_out),
+        *(Different(one.joint, one.quantity, one.change, one.from_s) for one in answer.changes),
+        *(Different(one.joint, "motion", one.amplitude_rad, None) for one in answer.extra),
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
     not_decided = answer.undecided is not None or answer.verdict in open_verdicts
