@@ -176,6 +176,7 @@ def _named(facts: Facts) -> str:
     for joint, several in list(by_joint.items())[:NAMED]:
         sizes = " and ".join(deviation_in_words(each) for each in several)
         clauses.append(f"{plain(joint)} responds differently from the others, {sizes}")
+    clauses += facts.findings.kinds
     if len(by_joint) > NAMED:
         names = [plain(joint) for joint in list(by_joint)[NAMED:]]
         clauses.append(f"{', '.join(names)} respond differently, too")
@@ -235,7 +236,7 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
     """Verdict, sentence and detail on the joints that are not named."""
     judged = facts.judgement
     named = bool(facts.not_following or judged.changes or judged.extra or judged.rests)
-    named |= bool(facts.findings.stand_out or facts.findings.undecided)
+    named |= bool(facts.findings.stand_out or facts.findings.undecided or facts.findings.kinds)
     if facts.motion is not None or facts.gait.frequency_hz.value is None:
         about = "no command" if facts.motion is not None else "no gait"
         return Verdict.NOTHING, _without_gait(facts), _why_not(facts, about)

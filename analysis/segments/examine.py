@@ -9,10 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import plain
 
 from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response.response import Response
 from ..results.answer import Shape, StandOut
+from .kinds import Split, split_of
 from .outliers import Deviation, standing_out
 from .profile import (
     LEVEL,
@@ -77,6 +79,7 @@ class Findings:
         undecided: Planes and groups in which joints differ and which one can't be decided.
         alike: Whether the rest of the compared joints is shown to be alike; None where it isn't.
         compared: Names of the joints that were compared.
+        kinds: Two kinds of joints, a clause each, where there are such.
     """
 
     stand_out: tuple[StandOut, ...] = ()
@@ -84,6 +87,7 @@ class Findings:
     undecided: tuple[tuple[str, int], ...] = ()
     alike: bool | None = None
     compared: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
 
 
 def examine(chains: Iterable[Chain]) -> Findings:
@@ -95,7 +99,13 @@ def examine(chains: Iterable[Chain]) -> Findings:
     Returns:
         The findings, all of one family-wise level.
     """
-    some = [each for each in chains if len(each.names) > 1 and each.errors is not None]
+    some: list[Chain] = []
+    kinds: list[str] = []
+    for chain in chains:
+        if len(chain.names) > 1 and chain.errors is not None:
+            parts, clause = _by_kind(chain)
+            some += parts
+            kinds += [clause] if clause else []
     profiles = [
         (chain, quantity, profile_of(chain, quantity)) for chain in some for quantity in _MARGINS
     ]
@@ -134,9 +144,46 @@ def examine(chains: Iterable[Chain]) -> Findings:
         stand_out=_ranked(out),
         shape=tuple(shape for _, shape in sorted(shapes, key=lambda each: -each[0])),
         undecided=tuple(undecided),
-        alike=True if alike else None,
+        alike=True if alike and not kinds else None,
+        kinds=tuple(kinds),
         compared=tuple(name for chain in some for name in chain.names),
     )
+
+
+def _by_kind(chain: Chain) -> tuple[list[Chain], str]:
+    """Divide a chain into two kinds of joints, if it has two; return the parts and a clause."""
+    splits = [
+        (quantity, split)
+        for quantity, margin in _MARGINS.items()
+        if (split := split_of(profile_of(chain, quantity).values, margin)) is not None
+    ]
+    if not splits:
+        return [chain], ""
+    _, split = max(splits, key=lambda entry: entry[1].sure)
+    parts = [_part(chain, index.tolist()) for index in (split.first, split.second)]
+    sizes = [_between(chain, quantity, split) for quantity in _MARGINS]
+    names = [f"{len(part.names)} as {plain(part.names[0])}" for part in parts]
+    said = " and ".join(size for size in sizes if size)
+    return parts, f"two kinds of joints: {names[0]}, {names[1]} with {said}"
+
+
+def _part(chain: Chain, index: list[int]) -> Chain:
+    scatter = chain.scatter
+    if scatter is not None:
+        scatter = scatter[0].select(index), scatter[1].select(index)
+    names = tuple(chain.names[k] for k in index)
+    return replace(chain, names=names, response=chain.response.select(index), scatter=scatter)
+
+
+def _between(chain: Chain, quantity: str, split: Split) -> str:
+    """How the second kind differs from the first in one quantity; empty within the margin."""
+    values = profile_of(chain, quantity).values
+    size = float(np.median(values[split.second]) - np.median(values[split.first]))
+    if abs(size) < _MARGINS[quantity]:
+        return ""
+    if quantity == "gain":
+        return f"{100 * abs(math.expm1(size)):.2g} % {'less' if size < 0 else 'more'} gain"
+    return f"{math.degrees(abs(size)):.2g}° {'less' if size < 0 else 'more'} lag"
 
 
 def profile_of(chain: Chain, quantity: str) -> Profile:

@@ -307,9 +307,16 @@ def _out_of_profile(
         return True
     partner = int(mirror[0])
     by_model = float(rows[partner] @ profile.values)
-    beside = _beside_neighbours(profile, others[others != partner], partner)
-    shown = [abs(each / one.value) for each in (by_model, *beside)]
-    return not any(MIRRORED <= share <= 1 / MIRRORED for share in shown)
+    rest = others[others != partner]
+    beside = _beside_neighbours(profile, rest, partner)
+    shown = [each / one.value for each in (by_model, *beside)]
+    if not any(MIRRORED <= abs(share) <= 1 / MIRRORED for share in shown):
+        return True
+    # A shape of the body has its flanks: inside of the ends, a pair that the joints on both sides
+    # don't follow is two joints.
+    inner = first < place[one.joint] < last and first < place[partner] < last
+    away = (*_beside_neighbours(profile, rest, one.joint), *beside)
+    return bool(inner) and min(each / one.value for each in away) > 1 - LOCAL
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:

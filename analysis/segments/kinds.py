@@ -1,0 +1,63 @@
+"""Two kinds of joints in one chain: other servos, or another load, of a part of them.
+
+Before a shape along the body is looked for, the values are sorted: where the widest gap is many
+times the scatter within both sides, and each side has joints enough, the joints are of two kinds
+(odd and even ones, two batches, two planes that nobody described) and each is compared with those
+of its own kind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray, IntArray
+
+from .outliers import ROBUST
+
+FEWEST = 3
+"""Joints of a kind, at least: of two, one may be a fault and the other chance."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Two kinds of joints.
+
+    Attributes:
+        first: Indices of the joints of the kind that the first joint belongs to.
+        second: Indices of the others.
+        sure: Gap in robust standard deviations within the kinds.
+    """
+
+    first: IntArray
+    second: IntArray
+    sure: float
+
+
+def split_of(values: FloatArray, margin: float) -> Split | None:
+    """Look for two kinds of joints.
+
+    Args:
+        values: One quantity of the joints, in the order of the chain, shape (m,).
+        margin: Difference that matters.
+
+    Returns:
+        The kinds; None where the values are one group, or fall into two neighbouring parts of the
+        chain, which a shape explains.
+    """
+    order = np.argsort(values)
+    best: Split | None = None
+    for size in range(FEWEST, values.size - FEWEST + 1):
+        low, high = order[:size], order[size:]
+        gap = float(values[high[0]] - values[low[-1]])
+        away = [np.abs(values[side] - np.median(values[side])) for side in (low, high)]
+        scatter = 1.4826 * float(np.median(np.concatenate(away)))
+        sure = gap / max(scatter, margin / (2 * ROBUST))
+        if gap > margin and sure > 2 * ROBUST and (best is None or sure > best.sure):
+            first, second = (low, high) if 0 in low else (high, low)
+            best = Split(np.sort(first), np.sort(second), sure)
+    if best is None:
+        return None
+    changes = int(np.count_nonzero(np.diff(np.isin(np.arange(values.size), best.first))))
+    return best if changes > 2 else None
