@@ -39,7 +39,11 @@ CONSTANTS = 5
 """Time constants of the first grid, each half of the one before."""
 
 ROUNDS = 5
-"""Refinements: a step of 50 ms becomes 1.6 ms, in which 60 degrees/s are 0.1 degrees."""
+"""Refinements, of which each moves on by the present step or halves it, before the steps of Gauss
+and Newton: from a grid of 50 ms they come within the 10 ms in which these converge."""
+
+DIFFERENCE_S = 1e-3
+"""Difference by which slopes are taken [s]: small against all lags of servos."""
 
 DAMPINGS = (1.0, 0.5)
 """Two equal poles, and the overshoot of a tenth that servos are tuned to at most."""
@@ -158,17 +162,45 @@ def fit_response(
     trimmed = _Trimmed(filtered.output(USUAL), y, there.astype(np.float64))
     bounds = _bounds(command, step_s)
     best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids(*bounds)]
-    step = bounds[0] / (DELAYS - 1)
+    steps = [bounds[0] / (DELAYS - 1) / 2] * len(best)
     for _ in range(ROUNDS):
-        step /= 2
-        moved = [_moved(response, step, *bounds) for _, response, _ in best]
+        moved = [_moved(best[k][1], steps[k], *bounds) for k in range(len(best))]
         outputs = filtered.outputs([response for some in moved for response in some])
         ends = np.cumsum([len(some) for some in moved])
         for k, some in enumerate(moved):
             part = outputs[ends[k] - len(some) : ends[k]]
-            best[k] = min(best[k], trimmed.best(part, some, best[k][2]), key=_merit)
+            better = trimmed.best(part, some, best[k][2])
+            if _merit(better) < _merit(best[k]):
+                best[k] = better
+            else:
+                steps[k] /= 2
+    best = [_polished(fit, trimmed, filtered, bounds) for fit in best]
     squares, response, _ = min(best, key=_merit)
     return response if squares < trimmed.least_variance else replace(response, gain=0.0)
+
+
+def _polished(
+    fit: _Fit, trimmed: _Trimmed, filtered: Filtered, bounds: tuple[float, float]
+) -> _Fit:
+    """Take steps of Gauss and Newton in gain, offset, delay and time constant."""
+    for _ in range(STEPS_OF_C):
+        _, centre, keep = fit
+        aside = [replace(centre, delay_s=centre.delay_s + DIFFERENCE_S)]
+        if centre.order:
+            aside.append(replace(centre, constant_s=centre.constant_s + DIFFERENCE_S))
+        outputs = filtered.outputs([centre, *aside])
+        slopes = centre.gain * (outputs[1:] - outputs[0]) / DIFFERENCE_S
+        delay, constant, *_ = (*trimmed.step(outputs[0], slopes, centre, keep), 0.0)
+        moved = replace(
+            centre,
+            delay_s=min(max(centre.delay_s + delay, 0.0), bounds[0]),
+            constant_s=min(max(centre.constant_s + constant, 0.0), bounds[1]),
+        )
+        better = trimmed.best(filtered.outputs([moved]), [moved], keep)
+        if _merit(better) >= _merit(fit):
+            break
+        fit = better
+    return fit
 
 
 def _bounds(command: FloatArray, step_s: float) -> tuple[float, float]:
@@ -293,6 +325,32 @@ class _Trimmed:
             responses[r], gain=float(gain[r, k]), offset_rad=offset_rad, explained=explained
         )
         return least, full, chosen
+
+    def step(
+        self, output: FloatArray, slopes: FloatArray, centre: Response, keep: FloatArray
+    ) -> list[float]:
+        """Return the step of Gauss and Newton over the kept blocks.
+
+        Args:
+            output: x, shape (p, n).
+            slopes: Derivatives of g x with respect to each of q parameters, shape (q, p, n).
+
+        Returns:
+            The step of each parameter, q.
+        """
+        sizes = np.diff(np.append(self._edges, self._weight.size))
+        kept = np.repeat(keep, sizes) * self._weight
+        x = output.ravel()
+        columns = [np.ones_like(x), x, *(slope.ravel() for slope in slopes)]
+        design = np.stack(columns, axis=1)
+        left = self._y + self._middle - centre.offset_rad - centre.gain * x
+        weighted = design * kept[:, None]
+        gram = weighted.T @ design
+        scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+        solution = np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-10) @ (
+            (weighted.T @ left) / scale
+        )
+        return [float(value) for value in (solution / scale)[2:]]
 
     def _concentrated(
         self, sums: FloatArray, keep: FloatArray

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from undulog.analysis.segments.kinds import split_of
 from undulog.analysis.segments.outliers import standing_out
 from undulog.analysis.segments.profile import (
     Member,
@@ -79,6 +80,49 @@ def test_two_that_are_off_do_not_hide_each_other():
     one = profile(rng, values)
     found = standing_out(one, critical_value([family_of(one)], draws=300))
     assert [each.joint for each in found] == [2, 7]
+
+
+@pytest.mark.parametrize("first", range(1, 6))
+def test_two_at_mirror_positions_are_named_unless_their_neighbours_follow(first):
+    rng = np.random.default_rng(first)
+    values = np.full(13, 0.5)
+    values[[first, 12 - first]] -= 30 * SIGMA
+    one = profile(rng, values)
+    found = standing_out(one, critical_value([family_of(one)], draws=300))
+    assert {each.joint for each in found} == {first, 12 - first}
+    along = np.linspace(-1, 1, 13)
+    smooth = profile(rng, 0.5 - 30 * SIGMA * np.exp(-(((abs(along) - 0.5) / 0.3) ** 2)))
+    assert standing_out(smooth, critical_value([family_of(smooth)], draws=300)) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "first"),
+    [
+        (np.where(np.arange(8) % 2, 0.4, 0.5), [0, 2, 4, 6]),
+        (np.where(np.isin(np.arange(9), [1, 2, 5, 7]), 0.4, 0.5), [0, 3, 4, 6, 8]),
+    ],
+)
+def test_two_kinds_of_joints_are_found_with_a_weak_one_among_them(values, first):
+    values = values + 1e-3 * np.random.default_rng(1).standard_normal(values.size)
+    found = split_of(values, 0.02)
+    assert found.first.tolist() == first
+    values[first[1]] -= 0.3
+    assert split_of(np.asarray(values), 0.02) is not None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.full(9, 0.5),
+        np.linspace(0.4, 0.6, 9),
+        np.repeat([0.4, 0.5], [4, 5]),
+        0.5 - 0.2 * np.linspace(-1, 1, 9) ** 2,
+        np.where(np.arange(9) == 4, 0.3, 0.5),
+    ],
+)
+def test_one_kind_is_not_divided(values):
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(values.size)
+    assert split_of(values + noise, 0.02) is None
 
 
 def test_below_the_margin_nobody_is_named():
