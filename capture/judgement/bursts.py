@@ -12,7 +12,7 @@ from scipy.special import bdtrc
 
 from ..common.arrays import BoolArray, FloatArray
 from .changes import ROBUST, TAME
-from .exposure import ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
+from .exposure import COHERENT, ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
 from .motion import Course
 from .record import RARE
 
@@ -48,6 +48,10 @@ def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[i
 def _far(residual: FloatArray) -> int:
     if residual.size == 0:
         return 0
-    away = np.abs(residual - np.median(residual))
-    limit = max(float(LARGEST_REST_RAD), 2 * TAME * ROBUST * float(np.median(away)))
-    return int(np.count_nonzero(away > limit))
+    residual = residual - np.median(residual)
+    away = np.abs(residual)
+    far = np.flatnonzero(away > max(float(LARGEST_REST_RAD), 2 * TAME * ROBUST * np.median(away)))
+    inner = far[far < residual.size - 1]
+    power = float(residual[inner] @ residual[inner])
+    # A joint that vibrates is where it was a sample before; noise is not.
+    return 0 if float(residual[inner] @ residual[inner + 1]) > COHERENT * power else far.size

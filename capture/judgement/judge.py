@@ -50,6 +50,10 @@ ORDERLY = 0.8
 WIDTH = 1.96
 """Standard errors of a 95 % interval."""
 
+SHORTEST_S = 2.0
+"""A shorter record is not judged [s]: it is the time on either side of a change that a size of it
+needs."""
+
 LEAST_RANGE_RAD = 1e-3
 """A command that moves less is held still [rad]: a step of a 12-bit encoder is 1.5e-3."""
 
@@ -120,6 +124,8 @@ def _lasts(motion: JointMotion) -> bool:
     if min(command.size, position.size) < 2:
         return False
     start, stop = max(command[0], position[0]), min(command[-1], position[-1])
+    if stop - start < SHORTEST_S:
+        return False
     return bool(np.count_nonzero((position >= start) & (position <= stop)) >= BLOCKS)
 
 

@@ -16,6 +16,10 @@ time of the judgement of 25 joints stay below 0.1 GB and some seconds."""
 ALTERNATE = 1.5
 """Steps without a sample from which a course has none there: with less, rounding decides."""
 
+ALIKE = 2
+"""Ratio of long to short cycles (90 and 10 %) of a rhythm at most: a gait that changes its pace by
+more is several gaits."""
+
 HYSTERESIS = 10
 """Share of the range about its middle that is no crossing, inverse: noise is less than that."""
 
@@ -140,10 +144,15 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
         command: Shape (n,).
 
     Returns:
-        With a hysteresis of a tenth of the range [s]; infinite for fewer than three rises.
+        With a hysteresis of a tenth of the range [s]; infinite for fewer than three rises, and
+        where the cycles are not alike, as in a chirp.
     """
     low, high = float(command.min()), float(command.max())
     away = np.abs(command - (low + high) / 2) > (high - low) / HYSTERESIS
     above = command[away] > (low + high) / 2
     rises = np.flatnonzero(away)[1:][above[1:] & ~above[:-1]]
-    return float(np.median(np.diff(rises))) * step_s if rises.size > 2 else float("inf")
+    if rises.size < 3:
+        return float("inf")
+    lengths = np.diff(rises)
+    short, long = np.quantile(lengths, (0.1, 0.9))
+    return float(np.median(lengths)) * step_s if long <= ALIKE * short else float("inf")

@@ -42,6 +42,9 @@ ROUNDS = 5
 """Refinements, of which each moves on by the present step or halves it, before the steps of Gauss
 and Newton: from a grid of 50 ms they come within the 10 ms in which these converge."""
 
+POLISHES = 8
+"""Steps of Gauss and Newton at most; each doubles the digits once it is near."""
+
 DIFFERENCE_S = 1e-3
 """Difference by which slopes are taken [s]: small against all lags of servos."""
 
@@ -183,7 +186,7 @@ def _polished(
     fit: _Fit, trimmed: _Trimmed, filtered: Filtered, bounds: tuple[float, float]
 ) -> _Fit:
     """Take steps of Gauss and Newton in gain, offset, delay and time constant."""
-    for _ in range(STEPS_OF_C):
+    for _ in range(POLISHES):
         _, centre, keep = fit
         aside = [replace(centre, delay_s=centre.delay_s + DIFFERENCE_S)]
         if centre.order:
@@ -191,12 +194,15 @@ def _polished(
         outputs = filtered.outputs([centre, *aside])
         slopes = centre.gain * (outputs[1:] - outputs[0]) / DIFFERENCE_S
         delay, constant, *_ = (*trimmed.step(outputs[0], slopes, centre, keep), 0.0)
-        moved = replace(
-            centre,
-            delay_s=min(max(centre.delay_s + delay, 0.0), bounds[0]),
-            constant_s=min(max(centre.constant_s + constant, 0.0), bounds[1]),
-        )
-        better = trimmed.best(filtered.outputs([moved]), [moved], keep)
+        moved = [
+            replace(
+                centre,
+                delay_s=min(max(centre.delay_s + delay / 2**k, 0.0), bounds[0]),
+                constant_s=min(max(centre.constant_s + constant / 2**k, 0.0), bounds[1]),
+            )
+            for k in range(STEPS_OF_C)  # where the whole step goes too far
+        ]
+        better = trimmed.best(filtered.outputs(moved), moved, keep)
         if _merit(better) >= _merit(fit):
             break
         fit = better

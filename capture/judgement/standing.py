@@ -67,10 +67,10 @@ def _by_effort(
     size = _effort(motion, spans, like)
     if size is None:
         return kinds, ""
-    if motion.effort is not None and _repeats(motion.effort, within(motion.effort.t_s, spans)):
-        return [*kinds, "stale_sensor"], "its effort repeats one value, too"
     if size < POWERLESS:
         return ["dead"], f"its effort is {100 * size:.0f} % of the usual one"
+    if motion.effort is not None and _repeats(motion.effort, within(motion.effort.t_s, spans)):
+        return [*kinds, "stale_sensor"], "its effort repeats one value, too"
     driven = [kind for kind in kinds if kind != "dead"]
     if _is_constant(motion.effort, spans):
         driven = ["stalled", *driven]

@@ -182,8 +182,8 @@ class Joint:
     lower: float = -math.pi / 6
     upper: float = math.pi / 6
     max_velocity: Positive = 10.0
-    sits: Seat = Seat.LOOP
     servo: Servo = field(default_factory=Servo)
+    sits: Seat = Seat.LOOP
 
     def contradictions(self) -> Iterator[tuple[str, str, str]]:
         """Check that the upper limit is above the lower one."""
