@@ -127,8 +127,12 @@ def examine(chains: Iterable[Chain]) -> Findings:
     for chain, quantity, profile in profiles:
         active = np.ones(len(chain.names), dtype=np.bool_)
         active[list(excluded[id(chain)])] = False
+        half = float(np.var(profile.values[active])) / 2
         found = [
-            each for each in contrasts(profile, active) if abs(each.value) > critical * each.error
+            each
+            for each in contrasts(profile, active)
+            if abs(each.value) > critical * each.error
+            and (each.kind == "each" or each.spread**2 >= half)
         ]
         if len(chain.names) < MIN_JOINTS:
             if found:

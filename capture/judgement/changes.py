@@ -91,6 +91,7 @@ class _Blocks:
     values: FloatArray
     weights: FloatArray
     edges_s: FloatArray
+    rhythmic: bool
 
 
 def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
@@ -142,11 +143,15 @@ def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
 
 
 def _least(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Blocks) -> float:
-    """Return the least change that matters; without like joints, one beyond the rest errors."""
+    """Return the least change that matters.
+
+    Without like joints, and where the motion is no rhythm, it is one beyond the rest errors: play,
+    stick and poles beyond two make another gain of every other motion.
+    """
     alone = len(exposure.group(k)) == 1
-    rest = REST_ERRORS * exposure.rest_rad[k] if alone else 0.0
+    rest = REST_ERRORS * exposure.rest_rad[k] if alone or not blocks.rhythmic else 0.0
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
-        return inf if alone else float(NOISE_MARGIN)
+        return inf if alone or not blocks.rhythmic else float(NOISE_MARGIN)
     if quantity == "offset":
         return max(float(ANGLE_MARGIN_RAD), rest)
     inside = slice(run.first, run.last)
@@ -186,7 +191,7 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         # Below the usual noise no change is of interest.
         values[3, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2 + 1e-12))
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
-    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64))
+    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half > 0)
 
 
 def _tamed(

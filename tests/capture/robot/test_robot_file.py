@@ -165,7 +165,7 @@ FAULTS = """worm.toml: 16 faults in this robot description
   joints[0].plane: found "horizontl"; valid: horizontal, vertical (did you mean horizontal?)
   defaults.joint.max_velocity: found true; valid: a finite number > 0
   joints[0].upper: found -1; valid: more than lower = -0.523599
-  joints[1].speed: found an unknown key; valid: name, plane, lower, upper, max_velocity, servo
+  joints[1].speed: found an unknown key; valid: name, plane, lower, upper, max_velocity, servo, sits
   defaults.link.radius: found "thick"; valid: a finite number > 0
   defaults.link.mass: found -0.1; valid: a finite number > 0
   defaults.link.inertia: found [4e-05, 5e-05, 0.0001]; valid: moments of which none exceeds the \
