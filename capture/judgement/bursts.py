@@ -11,9 +11,9 @@ import numpy as np
 from scipy.special import bdtrc
 
 from ..common.arrays import BoolArray, FloatArray
-from .changes import ROBUST, TAME
+from .changes import FEWEST, ROBUST, TAME
 from .exposure import COHERENT, ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
-from .motion import Course
+from .motion import Course, cycle_s
 from .record import RARE
 
 FEW = 0.003
@@ -28,8 +28,13 @@ def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[i
         usable: Steps that are looked at, shape (k, n).
 
     Returns:
-        Index of a joint to the share of its samples that are far.
+        Index of a joint to the share of its samples that are far; none unless all commands are
+        rhythms, of half cycles enough for a comparison.
     """
+    length_s = float(course.t_s[-1] - course.t_s[0])
+    cycles = [cycle_s(command, course.step_s) for command in course.command]
+    if not max(cycles) < 2 * length_s / FEWEST:
+        return {}
     residual = course.position - exposure.fitted
     count = usable.sum(axis=1)
     far = np.array([_far(residual[k][usable[k]]) for k in range(len(residual))], dtype=np.float64)

@@ -184,5 +184,5 @@ def covered(starts: BoolArray, length: int, size: int) -> BoolArray:
     change = np.zeros(size + 1, dtype=np.int64)
     index = np.flatnonzero(starts)
     np.add.at(change, index, 1)
-    np.add.at(change, index + length, -1)
+    np.add.at(change, np.minimum(index + length, size), -1)
     return np.asarray(np.cumsum(change)[:-1] > 0, dtype=np.bool_)

@@ -89,6 +89,7 @@ class Course:
         command: Commanded positions [rad], shape (k, n).
         position: Measured positions [rad], shape (k, n).
         present: Where a joint's position was sampled, shape (k, n).
+        asked: Where its command is known, shape (k, n): not in gaps of its record.
         step_s: Time from one step to the next [s].
     """
 
@@ -96,6 +97,7 @@ class Course:
     command: FloatArray
     position: FloatArray
     present: BoolArray
+    asked: BoolArray
     step_s: float
 
 
@@ -122,6 +124,7 @@ def course_of(motions: Sequence[JointMotion]) -> Course | None:
         np.stack([m.command.at(t_s) for m in motions]),
         np.stack([m.position.at(t_s) for m in motions]),
         np.stack([_present(m, t_s, step) for m in motions]),
+        np.stack([_asked(m.command.t_s, t_s) for m in motions]),
         step,
     )
 
@@ -135,6 +138,16 @@ def _present(motion: JointMotion, t_s: FloatArray, step_s: float) -> BoolArray:
     close = np.minimum(before, after) <= near
     commanded = (t_s >= motion.command.t_s[0]) & (t_s <= motion.command.t_s[-1] + near)
     return np.asarray(close & commanded, dtype=np.bool_)
+
+
+def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:
+    """Mark the steps that are in no gap between two commands."""
+    intervals = np.diff(command_s)
+    gaps = np.flatnonzero(intervals > 2 * ALTERNATE * float(np.quantile(intervals, 0.95)))
+    known = np.ones(t_s.size, dtype=np.bool_)
+    for gap in gaps.tolist():
+        known &= (t_s <= command_s[gap]) | (t_s >= command_s[gap + 1])
+    return known
 
 
 def cycle_s(command: FloatArray, step_s: float) -> float:

@@ -85,15 +85,21 @@ def _gain(exposure: Exposure, k: int) -> float:
 def usable_steps(course: Course, exposure: Exposure, stillness: Stillness) -> BoolArray:
     """Return where a joint can be compared with its response, shape (k, n).
 
-    Not where it stands, nor before its response to what was commanded before the record is over,
-    nor in the first cycle, in which play takes its side.
+    Not where it stands, nor before its response to what was commanded before the record, or in a
+    gap of it, is over, nor in the first cycle, in which play takes its side.
     """
     settled_s = [
         r.delay_s + SETTLED * r.constant_s * max(r.order, 1) + _first_cycle_s(command, course)
         for r, command in zip(exposure.responses, course.command, strict=True)
     ]
     begun = course.t_s - course.t_s[0] >= np.array(settled_s)[:, None]
-    return np.asarray(course.present & begun & ~stillness.stands, dtype=np.bool_)
+    unknown = np.stack(
+        [
+            covered(~asked, int(settled / course.step_s) + 1, course.t_s.size)
+            for asked, settled in zip(course.asked, settled_s, strict=True)
+        ]
+    )
+    return np.asarray(course.present & begun & ~unknown & ~stillness.stands, dtype=np.bool_)
 
 
 def _first_cycle_s(command: FloatArray, course: Course) -> float:
