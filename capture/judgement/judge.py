@@ -219,6 +219,8 @@ def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
     rival = min(float(left[k]), opposite)
     if best == k or left[best] > (1 - ORDERLY) * float(np.var(position)):
         return None
+    if rival < exposure.least_rad[k] ** 2:  # what a healthy joint may lose
+        return None
     return best if left[best] < RESPONDS * rival else None
 
 
