@@ -29,7 +29,7 @@ from .exposure import (
 )
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .lines import find_lines
-from .motion import Course, JointMotion, course_of
+from .motion import Course, JointMotion, course_of, cycle_s, rises_of
 from .naming import Verdict, in_words, permutation_of
 from .record import record_faults
 from .response import BLOCKS, Response, fit_response
@@ -54,6 +54,9 @@ SHORTEST_S = 2.0
 """A shorter record is not judged [s]: it is the time on either side of a change that a size of it
 needs."""
 
+RESOLVED = 8
+"""Samples of a cycle, at least: linear interpolation between them errs by 1 - cos(pi/8) = 8 %."""
+
 LEAST_RANGE_RAD = 1e-3
 """A command that moves less is held still [rad]: a step of a 12-bit encoder is 1.5e-3."""
 
@@ -67,7 +70,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     record = record_faults(motions)
     driven = [m for m in motions if m.command.range > LEAST_RANGE_RAD and _lasts(m)]
     course = course_of(driven)
-    if course is None:
+    if course is None or _too_seldom(course):
         faults = [record[m.name] for m in motions if m.name in record]
         return Judgement(tuple(faults))
     samples = course.position.size
@@ -118,6 +121,12 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     )
 
 
+def _too_seldom(course: Course) -> bool:
+    """Return whether a cycle has too few samples to compare what lies between them."""
+    cycles = [cycle_s(command, course.step_s) for command in course.command]
+    return bool(np.median(cycles) < RESOLVED * course.step_s)
+
+
 def _lasts(motion: JointMotion) -> bool:
     """Return whether command and position overlap, with samples for the blocks of a fit."""
     command, position = motion.command.t_s, motion.position.t_s
@@ -147,7 +156,7 @@ def _faults(
         if (leader := _leader(course, exposure, k)) is not None:
             text = f"carries out the command of {driven[leader].name}"
             faults[motion.name] = _whole(motion, ("swapped",), text)
-        elif response.gain < -RESPONDS and response.explained > COHERENT:
+        elif _is_opposite(course, exposure, k):
             kinds, why = opposite_kinds(motion)
             text = f"moves against its command, gain {response.gain:.2f}"
             faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
@@ -206,6 +215,21 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
     power = float(np.std(moved[inside]) * np.std(asked[inside]))
     covariance = float(np.cov(moved[inside], asked[inside])[0, 1])
     return power == 0 or abs(covariance) < COHERENT * power
+
+
+def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
+    """Return whether a joint moves against its command, by its own response and by a healthy one.
+
+    Of a cycle or two, a fit alone can't tell a sign from a delay.
+    """
+    response = exposure.responses[k]
+    if response.gain > -RESPONDS or response.explained < COHERENT:
+        return False
+    if rises_of(course.command[k]).size > 2:
+        return True
+    position: FloatArray = course.position[k] - course.position[k].mean()
+    healthy: FloatArray = exposure.healthy[k] - exposure.healthy[k].mean()
+    return float(position @ healthy) < 0
 
 
 def _leader(course: Course, exposure: Exposure, k: int) -> int | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..common.arrays import BoolArray, FloatArray
+from ..common.arrays import BoolArray, FloatArray, IntArray
 
 LARGEST_COURSE = 1 << 16
 """Steps of a course at most: an hour at 18 Hz, ten samples a cycle of the fastest gaits. Memory and
@@ -150,6 +150,14 @@ def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:
     return known
 
 
+def rises_of(command: FloatArray) -> IntArray:
+    """Return the steps at which a command of shape (n,) rises through its middle."""
+    low, high = float(command.min()), float(command.max())
+    away = np.abs(command - (low + high) / 2) > (high - low) / HYSTERESIS
+    above = command[away] > (low + high) / 2
+    return np.flatnonzero(away).astype(np.int64)[1:][above[1:] & ~above[:-1]]
+
+
 def cycle_s(command: FloatArray, step_s: float) -> float:
     """Return the median time from one rise of a command through its middle to the next.
 
@@ -160,10 +168,7 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
         With a hysteresis of a tenth of the range [s]; infinite for fewer than three rises, and
         where the cycles are not alike, as in a chirp.
     """
-    low, high = float(command.min()), float(command.max())
-    away = np.abs(command - (low + high) / 2) > (high - low) / HYSTERESIS
-    above = command[away] > (low + high) / 2
-    rises = np.flatnonzero(away)[1:][above[1:] & ~above[:-1]]
+    rises = rises_of(command)
     if rises.size < 3:
         return float("inf")
     lengths = np.diff(rises)
