@@ -60,7 +60,7 @@ ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py 
   tests/analysis tests/docs
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
-  $(addprefix tests/capture/,bus following robot) \
+  $(addprefix tests/capture/,bus judgement robot) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
 WAITING = $(addprefix tests/analysis/,estimators experiment response) \
