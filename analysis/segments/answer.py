@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
-from undulog.capture.judgement.fault import NOTHING, Change, ExtraMotion, Judgement, RestsOff
+from undulog.capture.judgement.fault import NOTHING, Judgement, clause_of
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
@@ -166,7 +166,7 @@ def _named(facts: Facts) -> str:
     if facts.judgement.naming:
         clauses.insert(0, plain(facts.judgement.naming))
     differences = (*facts.judgement.changes, *facts.judgement.extra, *facts.judgement.rests)
-    clauses += [_difference(difference) for difference in differences[:NAMED]]
+    clauses += [clause_of(each, plain(each.joint)) for each in differences[:NAMED]]
     changed = {change.joint for change in facts.judgement.changes}
     by_joint: dict[str, list[StandOut]] = {}
     for each in facts.findings.stand_out:
@@ -184,12 +184,6 @@ def _named(facts: Facts) -> str:
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
     return f"{'; '.join(clauses)}." if clauses else ""
-
-
-def _difference(difference: Change | ExtraMotion | RestsOff) -> str:
-    """A difference of one joint, as a clause."""
-    colon = ":" if isinstance(difference, Change) else ""
-    return f"{plain(difference.joint)}{colon} {difference.text}"
 
 
 def _left_out(facts: Facts) -> str:

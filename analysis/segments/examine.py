@@ -167,8 +167,8 @@ def _by_kind(chain: Chain) -> tuple[list[Chain], str]:
     parts = [_part(chain, index.tolist()) for index in (split.first, split.second)]
     sizes = [_between(chain, quantity, split) for quantity in _MARGINS]
     names = [f"{len(part.names)} as {plain(part.names[0])}" for part in parts]
-    said = " and ".join(size for size in sizes if size)
-    return parts, f"two kinds of joints: {names[0]}, {names[1]} with {said}"
+    differences = " and ".join(size for size in sizes if size)
+    return parts, f"two kinds of joints: {names[0]}, {names[1]} with {differences}"
 
 
 def _part(chain: Chain, index: list[int]) -> Chain:

@@ -1,1 +1,1 @@
-"""The judgement of joints."""
+"""Which joints of a session don't follow their command, which changed, and what else differs."""

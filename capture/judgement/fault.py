@@ -165,5 +165,10 @@ class Judgement:
     naming: str = ""
 
 
+def clause_of(difference: Change | ExtraMotion | RestsOff, name: str) -> str:
+    """Return a difference of one joint as a clause that begins with the joint's name."""
+    return f"{name}{':' if isinstance(difference, Change) else ''} {difference.text}"
+
+
 NOTHING = Judgement()
 """Of a session that can't be judged."""

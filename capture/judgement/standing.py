@@ -98,22 +98,6 @@ def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
     return ("inverted", "inverted_sensor"), ""
 
 
-def shifted_kinds(motion: JointMotion, from_s: float) -> tuple[tuple[str, ...], str]:
-    """Return the kinds that fit a zero that moved, and what decides."""
-    if motion.reference is None or motion.reference.t_s.size <= AGAIN:
-        return ("slipped", "slipped_sensor"), ""
-    t_s = motion.position.t_s
-    after = t_s >= from_s
-    gap = motion.position.values - motion.reference.at(t_s)
-    whole = motion.position.values - motion.command.at(t_s)
-    if not after.any() or after.all():
-        return ("slipped", "slipped_sensor"), ""
-    steps = [abs(np.median(v[after]) - np.median(v[~after])) for v in (gap, whole)]
-    if steps[0] > steps[1] / 2:
-        return ("slipped_sensor",), "the second sensor does not show it"
-    return ("slipped",), "the second sensor shows it, too"
-
-
 def within(t_s: FloatArray, spans: Sequence[Span]) -> BoolArray:
     """Mark the times, increasing, that lie in any span."""
     marked = np.zeros(t_s.size, dtype=np.bool_)

@@ -32,10 +32,6 @@ class Stillness:
     exposed: BoolArray
     stands: BoolArray
 
-    def share(self, joint: int) -> float:
-        """Return the share of its exposed time in which a joint stands, 0 to 1."""
-        return float(self.stands[joint].sum()) / max(int(self.exposed[joint].sum()), 1)
-
 
 def stillness_of(course: Course, exposure: Exposure) -> Stillness:
     """Find where joints stand although they had to move."""

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...judgement.fault import Fault as JointFault
-from ...judgement.fault import Judgement
+from ...judgement.fault import Judgement, clause_of
 from ..columns.names import one_name_sentences
 from ..messages import COMMAND_TOPIC
 from ..messages.definitions import VERDICTS
@@ -408,10 +408,8 @@ def judge_following(fault: JointFault) -> Finding:
 
 def judge_differences(judgement: Judgement) -> Iterator[Finding]:
     """Yield findings on joints that changed, or that move besides their command."""
-    for change in judgement.changes:
-        yield Finding(1, f"{change.joint}: {change.text}")
-    for extra in judgement.extra:
-        yield Finding(1, f"{extra.joint} {extra.text}")
+    for difference in (*judgement.changes, *judgement.extra):
+        yield Finding(1, clause_of(difference, difference.joint))
 
 
 def judge_bus(health: BusHealth) -> Iterator[Finding]:
