@@ -29,7 +29,7 @@ from .exposure import (
 )
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .lines import find_lines
-from .motion import Course, JointMotion, course_of, cycle_s, rises_of
+from .motion import Course, JointMotion, course_of, rises_of
 from .naming import Verdict, in_words, permutation_of
 from .record import record_faults
 from .response import BLOCKS, Response, fit_response
@@ -122,9 +122,15 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
 
 
 def _too_seldom(course: Course) -> bool:
-    """Return whether a cycle has too few samples to compare what lies between them."""
-    cycles = [cycle_s(command, course.step_s) for command in course.command]
-    return bool(np.median(cycles) < RESOLVED * course.step_s)
+    """Return whether commands turn between two samples, so that what lies between isn't known.
+
+    Of a sine of N samples a cycle the middle of two neighbours is off by 1 - cos(2 pi/N) of it.
+    """
+    middles = (course.command[:, 2:] + course.command[:, :-2]) / 2
+    off = np.median(np.abs(course.command[:, 1:-1] - middles), axis=1)
+    away = course.command - np.median(course.command, axis=1, keepdims=True)
+    most = 1 - np.cos(2 * np.pi / RESOLVED)
+    return bool(np.median(off - most * np.median(np.abs(away), axis=1)) > 0)
 
 
 def _lasts(motion: JointMotion) -> bool:
