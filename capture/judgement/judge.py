@@ -122,15 +122,16 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
 
 
 def _too_seldom(course: Course) -> bool:
-    """Return whether commands turn between two samples, so that what lies between isn't known.
+    """Return whether most commands are rhythms of too few samples to compare what lies between.
 
-    Of a sine of N samples a cycle the middle of two neighbours is off by 1 - cos(2 pi/N) of it.
+    A rhythm of N samples a cycle satisfies (c[i - 1] + c[i + 1]) / 2 = cos(2 pi / N) c[i].
     """
-    middles = (course.command[:, 2:] + course.command[:, :-2]) / 2
-    off = np.median(np.abs(course.command[:, 1:-1] - middles), axis=1)
-    away = course.command - np.median(course.command, axis=1, keepdims=True)
-    most = 1 - np.cos(2 * np.pi / RESOLVED)
-    return bool(np.median(off - most * np.median(np.abs(away), axis=1)) > 0)
+    command = course.command - np.median(course.command, axis=1, keepdims=True)
+    now, middle = command[:, 1:-1], (command[:, 2:] + command[:, :-2]) / 2
+    cosine = np.sum(now * middle, axis=1) / np.sum(now**2, axis=1)
+    left, size = np.median(np.abs([middle - cosine[:, None] * now, now]), axis=2)
+    seldom = (left < COHERENT * size) & (cosine < np.cos(2 * np.pi / RESOLVED))
+    return bool(2 * np.count_nonzero(seldom) > seldom.size)
 
 
 def _lasts(motion: JointMotion) -> bool:
@@ -166,12 +167,14 @@ def _faults(
             kinds, why = opposite_kinds(motion)
             text = f"moves against its command, gain {response.gain:.2f}"
             faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
-        elif (unit := _unit_factor(k, exposure)) is not None:
-            text = f"moves {unit} times as far as commanded"
+        elif _gain_is(exposure, k, np.degrees(1.0)):
+            text = "moves 180/pi times as far as commanded"
             faults[motion.name] = _whole(motion, ("scaled_sensor",), text)
         elif stands.any():
             spans = tuple(_trimmed(span, course, k, exposure) for span in _spans(stands, course))
             kinds, why = standing_kinds(motion, spans, like)
+            if _gain_is(exposure, k, np.radians(1.0)):
+                kinds = (*kinds, "scaled_sensor")
             if len(spans) > 1 and not {"at_limit"} & {*kinds} and kinds != ("frozen_sensor",):
                 kinds = ("intermittent", *kinds)
             text = _stood(spans, course, k, exposure)
@@ -277,15 +280,12 @@ def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
     return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
-def _unit_factor(k: int, exposure: Exposure) -> str | None:
-    """Return the factor between degrees and radians that a gain shows, in words."""
+def _gain_is(exposure: Exposure, k: int, factor: float) -> bool:
+    """Return whether a joint's gain is a factor between units, up to what a servo's gain may be."""
     response = exposure.responses[k]
     if response.explained < COHERENT or response.gain <= 0:
-        return None
-    for factor, text in ((np.degrees(1.0), "180/pi"), (np.radians(1.0), "pi/180")):
-        if abs(np.log(response.gain / factor)) < np.log(UNIT_SLACK):
-            return text
-    return None
+        return False
+    return abs(float(np.log(response.gain / factor))) < np.log(UNIT_SLACK)
 
 
 def _spans(marked: BoolArray, course: Course) -> tuple[Span, ...]:

@@ -25,7 +25,7 @@ stated, unless their amplitudes differ.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import combinations
@@ -168,6 +168,9 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
     best = _simplest(pairs, named, others)
     if np.count_nonzero(best.explained >= FOLLOWS) < 0.5 * np.count_nonzero(pairs.judged):
         return Naming(Verdict.UNKNOWN, interchangeable=alike)
+    turned = _inverted(pairs, named, range(pairs.judged.size))
+    if turned.delay_s <= best.delay_s and _as_good(turned, best):
+        return Naming(Verdict.FITS, (turned,), (), alike)  # one sign for all is simpler
     if best is not named:
         return _permuted(pairs, named, best, alike)
     at_once = np.diagonal(pairs.explained[0])[pairs.judged]
@@ -201,8 +204,10 @@ def _permuted(
     rivals = [one for one in regular if _as_good(one, best)]
     rivals = [one for one in rivals if one.permutation != best.permutation]
     if decided_by:
-        inverted = _inverted(pairs, named, best, decided_by)
-        rivals += [] if inverted is None else [inverted]
+        inverted = _inverted(pairs, named, decided_by)
+        lost = best.explained - inverted.explained
+        worse = max(float(np.mean(lost)), float(np.mean(lost[list(decided_by)]))) > AS_GOOD
+        rivals += [] if worse or _deciding(best, inverted) else [inverted]
         alone = len(decided_by) == 1 and not _fits_in(best, decided_by[0])
     elif float(np.mean(loss[follow])) < SUGGESTS:
         return fits
@@ -402,18 +407,13 @@ def _explanation(pairs: _Pairs, order: Sequence[int]) -> Explanation:
     return Explanation(kind, tuple(order), float(pairs.delay_s[best]), shares[best])
 
 
-def _inverted(
-    pairs: _Pairs, named: Explanation, best: Explanation, decided_by: Sequence[int]
-) -> Explanation | None:
-    """Return the names as they are, with inverted joints, if these explain what decides."""
-    joints, deciding = list(named.permutation), list(decided_by)
+def _inverted(pairs: _Pairs, named: Explanation, which: Iterable[int]) -> Explanation:
+    """Return the names as they are, with some joints inverted."""
+    joints, turned = list(named.permutation), list(which)
     shares: FloatArray = pairs.explained[:, joints, joints]
-    shares[:, deciding] = pairs.opposite[:, deciding, deciding]
+    shares[:, turned] = pairs.opposite[:, turned, turned]
     at = int(np.argmax(shares.sum(axis=1)))
-    inverted = Explanation(Kind.INVERTED, named.permutation, float(pairs.delay_s[at]), shares[at])
-    loss = best.explained - inverted.explained
-    worse = max(float(np.mean(loss)), float(np.mean(loss[deciding]))) > AS_GOOD
-    return None if worse or _deciding(best, inverted) else inverted
+    return Explanation(Kind.INVERTED, named.permutation, float(pairs.delay_s[at]), shares[at])
 
 
 def _interchangeable(commands: FloatArray) -> tuple[tuple[int, ...], ...]:

@@ -88,6 +88,28 @@ def test_a_vibration_near_the_limit_of_the_sampling_is_no_noise(chain):
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize("lost", [0, 40])
+def test_a_gait_of_fewer_than_three_samples_a_cycle_accuses_nobody(chain, lost):
+    phase = 2.5 * np.arange(chain.t.size) + np.arange(9)[:, None]
+    chain.command, chain.position = 0.35 * np.sin(phase), 0.35 * np.sin(phase + 0.5)
+    for values in (chain.command, chain.position):
+        values[:, 100 : 100 + lost] = values[:, [100]]
+    assert chain.judged() == {}
+
+
+def test_all_joints_inverted_are_not_named_wrongly():
+    chain = Chain(25, step=-np.pi / 6)
+    chain.position *= -1
+    judgement = judge(chain.motions())
+    assert {fault.kinds for fault in judgement.faults} == {("inverted", "inverted_sensor")}
+    assert (len(judgement.faults), judgement.naming) == (25, "")
+
+
+def test_a_joint_that_is_dragged_may_be_dead_or_scaled(chain):
+    chain.position[BROKEN] = np.radians(chain.position[BROKEN])
+    assert set(chain.judged()["j4"].kinds) >= {"dead", "scaled_sensor"}
+
+
 def test_a_noisy_coarse_encoder_repeats_values_by_chance():
     for seed in range(20):
         assert coarse(seed).judged() == {}
