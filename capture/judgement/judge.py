@@ -19,6 +19,7 @@ from .bursts import find_bursts
 from .changes import Jump, find_jumps
 from .exposure import (
     COHERENT,
+    ENOUGH_LIKE,
     RESPONDS,
     REST_ERRORS,
     Exposure,
@@ -242,7 +243,13 @@ def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
 
 
 def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
-    """Return the joint whose command explains the motion of another, as its own does not."""
+    """Return the joint whose command explains the motion of another, as its own does not.
+
+    What healthy joints make of a command is known from like joints; without them a joint that
+    responds to its own command may lag as it does.
+    """
+    if len(exposure.group(k)) < ENOUGH_LIKE and responds(exposure.responses[k]):
+        return None
     position: FloatArray = course.position[k]
     position = position - position.mean()
     healthy = exposure.healthy - np.mean(exposure.healthy, axis=1, keepdims=True)

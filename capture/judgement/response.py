@@ -178,8 +178,7 @@ def fit_response(
             else:
                 steps[k] /= 2
     best = [_polished(fit, trimmed, filtered, bounds) for fit in best]
-    squares, response, _ = min(best, key=_merit)
-    return response if squares < trimmed.least_variance else replace(response, gain=0.0)
+    return min(best, key=_merit)[1]
 
 
 def _polished(
@@ -291,9 +290,6 @@ class _Trimmed:
         for row, first in enumerate(np.linspace(0, self._keep, len(starts) - 1, dtype=int), 1):
             starts[row, first : first + third] = 0
         self._starts = starts
-        n, y, yy = self._of_y
-        variances = np.sort(np.maximum(yy - y**2 / np.maximum(n, 1), 0))
-        self.least_variance = float(variances[: self._keep].sum())
 
     def best(
         self, outputs: FloatArray, responses: Sequence[Response], keep: FloatArray | None = None

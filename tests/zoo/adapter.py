@@ -74,8 +74,8 @@ class Different:
     """A joint that a sentence states to respond differently from the others.
 
     Attributes:
-        quantity: ``gain``, ``lag``, ``offset``, ``noise``, or ``motion`` at a frequency that isn't
-            the command's.
+        quantity: ``gain``, ``lag``, ``offset``, ``noise``, ``motion`` at a frequency that isn't
+            the command's, or ``rest`` off the command.
         value: Relative for a gain, a ratio for noise, rad or s for the others.
         onset_s: Start [s]; None: no onset is stated.
     """
@@ -162,6 +162,7 @@ def stated(signals: Signals) -> Said:
         *(Different(one.joint, one.quantity, one.deviation, None) for one in answer.stand_out),
         *(Different(one.joint, one.quantity, one.change, one.from_s) for one in answer.changes),
         *(Different(one.joint, "motion", one.amplitude_rad, None) for one in answer.extra),
+        *(Different(one.joint, "rest", one.offset_rad, None) for one in answer.rests),
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
     not_decided = answer.undecided is not None or answer.verdict in open_verdicts

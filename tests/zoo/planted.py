@@ -68,10 +68,10 @@ GAIN = {"names": {"weak", "scaled_sensor"}, "quantities": {"gain"}}
 LATE = {"names": {"late"}, "allowed": {"stale_sensor"}, "quantities": {"lag"}, "sign": 1.0}
 """A lag is stated as such; an old value is later, too."""
 
-ZERO = {"names": {"slipped", "slipped_sensor"}, "quantities": {"offset"}}
-"""A zero that moved is the joint's or its sensor's."""
+ZERO = {"names": {"slipped", "slipped_sensor"}, "quantities": {"offset", "rest"}}
+"""A zero that moved is the joint's or its sensor's, or the joint rests off its command."""
 
-LINE = {"names": {"vibrating"}, "allowed": {"noisy_sensor"}, "quantities": {"line"}}
+LINE = {"names": {"vibrating"}, "allowed": {"noisy_sensor"}, "quantities": {"motion"}}
 """Motion at another frequency than the command's."""
 
 LIMIT = {"names": {"at_limit", "clipped_sensor"}, "quantities": {"gain", "offset", "lag"}}

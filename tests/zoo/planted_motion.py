@@ -62,7 +62,8 @@ def vibration_from(healthy, rng, joints, least):
         return None
     since, acts = onset(healthy, rng, j)
     change, sizes = _line(healthy, j, angle, 1.0 * acts, least)
-    return single(change, **LINE, sizes=sizes, since_s=since)
+    either = {"motion", "noise"}  # more of the residual's power, of a kind that isn't stated
+    return single(change, **LINE | {"quantities": either}, sizes=sizes, since_s=since)
 
 
 @fault(PERIODIC)
@@ -92,7 +93,9 @@ def noisy(healthy, rng, joints, least):
     sizes = (deviation, half, deviation > more)
     change = Change(j, reading=lambda read: read + noise)
     allowed = {"intermittent", "vibrating"}
-    return single(change, {"noisy_sensor"}, allowed, sizes=sizes, since_s=since)
+    return single(
+        change, {"noisy_sensor"}, allowed, quantities={"noise"}, sizes=sizes, since_s=since
+    )
 
 
 def _limited(healthy, j, limit, least):

@@ -61,7 +61,9 @@ def judged(
     """
     planted = {names[joint.joint]: joint for joint in joints}
     accused = tuple(a.joint for a in statement.accused if a.joint not in planted)
-    different = dict.fromkeys(d.joint for d in statement.different if d.joint not in planted)
+    # Of a rest it is stated where the joint was; it is compared with no other.
+    compared = [d for d in statement.different if d.quantity != "rest"]
+    different = dict.fromkeys(d.joint for d in compared if d.joint not in planted)
     stated = {a.joint for a in statement.accused} | {d.joint for d in statement.different}
     verdict = Verdict(
         accused, tuple(different), statement.shaped, statement.alike, silent=not stated
