@@ -3,15 +3,15 @@
 The residual of a joint's response is regressed, in blocks of time, on one, on the response and on
 its rate: offset, relative gain and lag of each block; the logarithm of what is left is its noise.
 Where there are like joints, their median in the same block is taken off: what all do is no joint's
-change. For each run of blocks the mean inside is compared with that outside,
+change. The estimates v_i of b blocks, of weights w_i, are a level and one run of blocks beside it,
 
-    t = (m_in - m_out) / (s sqrt(r (1/W_in + 1/W_out))),
+    v_i = m + c 1(i in run) + s n_i / sqrt(w_i),                                             (1)
 
-with the weights W of the regressions, the scatter s within both parts, and r = (1 + rho)/(1 - rho)
-for the correlation rho from block to block, of which the median over the joints is taken, its bias
-of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi 10.1093/biomet/41.3-4.390).
-Student's t has as many degrees of freedom as there are independent blocks, less two. Level: half
-for the lasting changes, of which there are about b a joint and quantity, half for the passing ones,
+with n an autoregression of the correlation rho from block to block, of which the median over the
+joints is taken, its bias of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi
+10.1093/biomet/41.3-4.390). Generalised least squares gives c and its error for each run (Prais &
+Winsten, Cowles Commission 383, 1954); c over its error has Student's distribution. Level: half for
+the lasting changes, of which there are about b a joint and quantity, half for the passing ones,
 b^2/2 (Bonferroni).
 """
 
@@ -24,8 +24,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from .exposure import ENOUGH_LIKE, REST_ERRORS, Exposure
-from .motion import Course, cycle_s
+from .exposure import ENOUGH_LIKE, Exposure
+from .motion import ALIKE, Course, cycle_s
 from .stillness import FULL
 
 LEVEL = 0.01
@@ -45,6 +45,9 @@ ANGLE_MARGIN_RAD = np.radians(1.0)
 
 NOISE_MARGIN = np.log(2.0)
 """Logarithm of the ratio of noise that matters: twice as much."""
+
+WIDTH = 1.96
+"""Standard errors of a 95 % interval."""
 
 QUANTITIES = ("offset", "gain", "lag", "noise")
 
@@ -92,6 +95,7 @@ class _Blocks:
     weights: FloatArray
     edges_s: FloatArray
     rhythmic: bool
+    lost_rad: FloatArray  # what the response leaves in half of the blocks, two deviations
 
 
 def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
@@ -110,11 +114,11 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     for q, quantity in enumerate(QUANTITIES):
         values, weights = blocks.values[q], blocks.weights[q]
         values, weights = _without_common(values, weights, exposure)
-        inflation = _inflation(values, weights)
+        rho = _correlation(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
         for k in range(weights.shape[0]):
-            run = _largest(values[k], weights[k], inflation, tests)
-            if run is None or abs(run.change) < _least(quantity, k, exposure, run, blocks):
+            run = _largest(values[k], weights[k], rho, tests)
+            if run is None or not _matters(quantity, k, exposure, run, blocks):
                 continue
             # Noise is what no other quantity explains.
             drop = 0.0 if quantity == "noise" else run.drop
@@ -142,27 +146,44 @@ def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
     )
 
 
-def _least(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Blocks) -> float:
-    """Return the least change that matters.
+def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Blocks) -> bool:
+    """Return whether a change is one that matters: its interval isn't within the margin.
 
-    Without like joints, and where the motion is no rhythm, it is one beyond the rest errors: play,
-    stick and poles beyond two make another gain of every other motion.
+    Without like joints, and where the motion is no rhythm, it is also beyond what a response leaves
+    of the joint's motion, and the motion is alike before and after: play, stick and poles beyond
+    two make another gain of every other motion.
     """
-    alone = len(exposure.group(k)) == 1
-    rest = REST_ERRORS * exposure.rest_rad[k] if alone or not blocks.rhythmic else 0.0
+    alone = len(exposure.group(k)) == 1 or not blocks.rhythmic
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
-        return inf if alone or not blocks.rhythmic else float(NOISE_MARGIN)
+        return not alone and _reaches(run, float(NOISE_MARGIN))
+    lost = float(blocks.lost_rad[k]) if alone else 0.0
     if quantity == "offset":
-        return max(float(ANGLE_MARGIN_RAD), rest)
+        return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
     inside = slice(run.first, run.last)
-    _, motion, rate, count = blocks.weights[:, k, inside].sum(axis=1)
-    amplitude = max((2 * motion / max(count, 1)) ** 0.5, 1e-9)
+    _, motion, rate, count = blocks.weights[:, k]
+    if alone and not _alike(motion, rate, inside):
+        return False
+    samples = max(float(count[inside].sum()), 1.0)
+    amplitude = max((2 * float(motion[inside].sum()) / samples) ** 0.5, 1e-9)
     if quantity == "gain":
-        return max(GAIN_MARGIN, rest / amplitude)
+        return _reaches(run, GAIN_MARGIN) and abs(run.change) > lost / amplitude
+    speed = max((2 * float(rate[inside].sum()) / samples) ** 0.5, 1e-9)
     # One degree of a cycle, as an angle of the wave of that amplitude and rate.
-    return max(float(ANGLE_MARGIN_RAD) * amplitude, rest) / max(
-        (2 * rate / max(count, 1)) ** 0.5, 1e-9
-    )
+    margin = float(ANGLE_MARGIN_RAD) * amplitude / speed
+    return _reaches(run, margin) and abs(run.change) > lost / speed
+
+
+def _reaches(run: _Run, margin: float) -> bool:
+    """Return whether the 95 % interval of a change, that excludes 0, isn't within a margin."""
+    return abs(run.change) + WIDTH * run.error > margin
+
+
+def _alike(motion: FloatArray, rate: FloatArray, inside: slice) -> bool:
+    """Return whether the frequency of the motion inside of a run is that outside, by a factor."""
+    ratios: list[float] = []
+    for sums in ((motion[inside].sum(), rate[inside].sum()), (motion.sum(), rate.sum())):
+        ratios.append(float(sums[1]) / max(float(sums[0]), 1e-300))
+    return 1 / ALIKE**2 < ratios[0] / max(ratios[1], 1e-300) < ALIKE**2
 
 
 def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | None:
@@ -180,6 +201,7 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
     joints = course.position.shape[0]
     values = np.zeros((len(QUANTITIES), joints, count))
     weights = np.zeros_like(values)
+    lost = np.zeros(joints)
     for k in range(joints):
         residual = course.position[k] - exposure.fitted[k]
         rate = np.gradient(exposure.fitted[k], course.step_s)
@@ -188,10 +210,11 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         residual, scatter = _tamed(residual, there, count, width)
         rows = np.stack([np.ones_like(rate), exposure.fitted[k] - level, -rate, residual])
         values[:3, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
+        lost[k] = 2 * float(np.median(scatter[weights[3, k] > 0])) if weights[3, k].any() else 0.0
         # Below the usual noise no change is of interest.
         values[3, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2 + 1e-12))
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
-    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half > 0)
+    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half > 0, lost)
 
 
 def _tamed(
@@ -291,8 +314,8 @@ def _without_common(
     return result, compared
 
 
-def _inflation(values: FloatArray, weights: FloatArray) -> float:
-    """Return (1 + rho)/(1 - rho) of the median joint."""
+def _correlation(values: FloatArray, weights: FloatArray) -> float:
+    """Return the correlation from block to block of the median joint."""
     found: list[float] = []
     for value, weight in zip(values, weights, strict=True):
         kept = value[weight > 0]
@@ -302,24 +325,23 @@ def _inflation(values: FloatArray, weights: FloatArray) -> float:
             power = float(away @ away)
             rho = float(away[1:] @ away[:-1]) / power if power > 0 else 0.0
             found.append(rho + (1 + 4 * max(rho, 0.0)) / kept.size)
-    rho = min(max(float(np.median(found)), 0.0), 0.9) if found else 0.0
-    return (1 + rho) / (1 - rho)
+    return min(max(float(np.median(found)), 0.0), 0.95) if found else 0.0
 
 
-def _largest(values: FloatArray, weights: FloatArray, inflation: float, tests: int) -> _Run | None:
+def _largest(values: FloatArray, weights: FloatArray, rho: float, tests: int) -> _Run | None:
     """Return the most certain run of blocks, or None if none is beyond the level."""
     known = np.flatnonzero(weights > 0)
-    if known.size < FEWEST:
-        return None
     v, w = values[known], weights[known]
+    # So many blocks of one weight know as much.
+    if known.size < FEWEST or float(w.sum()) ** 2 < FEWEST * float(w @ w):
+        return None
     best: tuple[float, _Run] | None = None
     for lasting in (True, False):
         first, last = _runs(known.size, lasting=lasting)
         if not first.size:
             continue
-        change, inside, error = _tested(v, w, first, last, inflation)
-        freedom = max((known.size - 2) / inflation, 1.0)
-        limit = -float(stdtrit(freedom, LEVEL / 4 / tests / first.size))
+        change, outside, error = _fitted(v, w, first, last, rho)
+        limit = -float(stdtrit(known.size - 3, LEVEL / 4 / tests / first.size))
         t = np.abs(change) / error
         k = int(np.argmax(t))
         if t[k] > limit and (best is None or t[k] / limit > best[0]):
@@ -327,8 +349,7 @@ def _largest(values: FloatArray, weights: FloatArray, inflation: float, tests: i
             stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
             inner = float(w[first[k] : last[k]].sum())
             drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
-            outside = (float(w @ v) - inner * float(inside[k])) / (float(w.sum()) - inner)
-            run = _Run(float(change[k]), outside, float(error[k]), start, stop, drop)
+            run = _Run(float(change[k]), float(outside[k]), float(error[k]), start, stop, drop)
             best = t[k] / limit, run
     return None if best is None else best[1]
 
@@ -346,15 +367,33 @@ def _runs(count: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
     return first[inner], last[inner]
 
 
-def _tested(
-    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, inflation: float
+def _fitted(
+    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return change, mean inside, and standard error of the change of runs."""
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
-    inside = sums[:, last] - sums[:, first]
-    outside = sums[:, -1:] - inside
-    (wi, vi, si), (wo, vo, so) = inside, outside
-    change = vi / wi - vo / wo
-    squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
-    variance = squares / max(v.size - 2, 1) * inflation * (1 / wi + 1 / wo)
-    return change, vi / wi, np.sqrt(np.maximum(variance, 1e-300))
+    """Return c and m of equation (1), and the standard error of c, of runs."""
+    scale = np.sqrt(w)
+    whole = _whitened(scale, rho)
+    target = _whitened(scale * v, rho)
+    # A whitened run is that of all blocks inside, and differs where it begins and after its end.
+    begin = scale * np.where(np.arange(v.size) == 0, (1 - rho**2) ** 0.5, 1.0)
+    sums = np.concatenate([np.zeros((2, 1)), np.cumsum([whole**2, whole * target], axis=1)], axis=1)
+    after = np.minimum(last, v.size - 1)
+    behind = np.where(last < v.size, -rho * scale[last - 1], 0.0)
+    own, of_target = sums[:, last] - sums[:, first + 1]
+    power = own + begin[first] ** 2 + behind**2
+    along = own + begin[first] * whole[first] + behind * whole[after]
+    moment = of_target + begin[first] * target[first] + behind * target[after]
+    level, total = sums[0, -1], sums[1, -1]
+    free = np.maximum(power - along**2 / level, 1e-300)
+    change = (moment - along * total / level) / free
+    left = float(target @ target) - total**2 / level - change**2 * free
+    variance = np.maximum(left, 1e-300) / max(v.size - 3, 1) / free
+    return change, (total - change * along) / level, np.sqrt(variance)
+
+
+def _whitened(values: FloatArray, rho: float) -> FloatArray:
+    """Take the autoregression off, the first value scaled as all before would have made it."""
+    result = values.copy()
+    result[1:] -= rho * values[:-1]
+    result[0] *= (1 - rho**2) ** 0.5
+    return result

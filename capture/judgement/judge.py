@@ -16,7 +16,7 @@ import numpy as np
 from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
 from .bursts import find_bursts
-from .changes import Jump, find_jumps
+from .changes import WIDTH, Jump, find_jumps
 from .exposure import (
     COHERENT,
     ENOUGH_LIKE,
@@ -47,9 +47,6 @@ UNIT_SLACK = 1.6
 
 ORDERLY = 0.8
 """Explained share of the other joints beside which one that follows nothing stands out."""
-
-WIDTH = 1.96
-"""Standard errors of a 95 % interval."""
 
 SHORTEST_S = 2.0
 """A shorter record is not judged [s]: it is the time on either side of a change that a size of it
