@@ -25,7 +25,7 @@ from scipy.special import stdtrit
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from .exposure import ENOUGH_LIKE, Exposure
-from .motion import ALIKE, Course, cycle_s
+from .motion import Course, cycle_s, is_sweep
 from .stillness import FULL
 
 LEVEL = 0.01
@@ -94,8 +94,16 @@ class _Blocks:
     values: FloatArray
     weights: FloatArray
     edges_s: FloatArray
-    rhythmic: bool
-    lost_rad: FloatArray  # what the response leaves in half of the blocks, two deviations
+    half_s: float  # half of the longest cycle; 0 where the commands are no rhythms
+    lost_rad: FloatArray  # what the response leaves in half of the blocks, three deviations
+    swept: tuple[bool, ...]  # whether the frequency of a command follows from the time
+
+    @property
+    def shortest(self) -> int:
+        """Blocks of a change, at least."""
+        block_s = float(self.edges_s[1] - self.edges_s[0])
+        least_s = max(HALF_CYCLES * self.half_s, SHORTEST_S)
+        return max(SHORTEST, int(np.ceil(least_s / block_s - 1e-6)))
 
 
 def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
@@ -117,7 +125,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
         rho = _correlation(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
         for k in range(weights.shape[0]):
-            run = _largest(values[k], weights[k], rho, tests)
+            run = _largest(values[k], weights[k], rho, tests, blocks.shortest)
             if run is None or not _matters(quantity, k, exposure, run, blocks):
                 continue
             # Noise is what no other quantity explains.
@@ -150,10 +158,11 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Bloc
     """Return whether a change is one that matters: its interval isn't within the margin.
 
     Without like joints, and where the motion is no rhythm, it is also beyond what a response leaves
-    of the joint's motion, and the motion is alike before and after: play, stick and poles beyond
-    two make another gain of every other motion.
+    of the joint's motion, and the command is no sweep: play, stick and poles beyond two make another
+    gain of every other motion.
     """
-    alone = len(exposure.group(k)) == 1 or not blocks.rhythmic
+    compared = len(exposure.group(k)) >= ENOUGH_LIKE
+    alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
         return not alone and _reaches(run, float(NOISE_MARGIN))
     lost = float(blocks.lost_rad[k]) if alone else 0.0
@@ -161,7 +170,7 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Bloc
         return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
     inside = slice(run.first, run.last)
     _, motion, rate, count = blocks.weights[:, k]
-    if alone and not _alike(motion, rate, inside):
+    if blocks.swept[k] and not compared:  # another time is another frequency
         return False
     samples = max(float(count[inside].sum()), 1.0)
     amplitude = max((2 * float(motion[inside].sum()) / samples) ** 0.5, 1e-9)
@@ -176,14 +185,6 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Bloc
 def _reaches(run: _Run, margin: float) -> bool:
     """Return whether the 95 % interval of a change, that excludes 0, isn't within a margin."""
     return abs(run.change) + WIDTH * run.error > margin
-
-
-def _alike(motion: FloatArray, rate: FloatArray, inside: slice) -> bool:
-    """Return whether the frequency of the motion inside of a run is that outside, by a factor."""
-    ratios: list[float] = []
-    for sums in ((motion[inside].sum(), rate[inside].sum()), (motion.sum(), rate.sum())):
-        ratios.append(float(sums[1]) / max(float(sums[0]), 1e-300))
-    return 1 / ALIKE**2 < ratios[0] / max(ratios[1], 1e-300) < ALIKE**2
 
 
 def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | None:
@@ -210,11 +211,12 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         residual, scatter = _tamed(residual, there, count, width)
         rows = np.stack([np.ones_like(rate), exposure.fitted[k] - level, -rate, residual])
         values[:3, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
-        lost[k] = 2 * float(np.median(scatter[weights[3, k] > 0])) if weights[3, k].any() else 0.0
+        lost[k] = 3 * float(np.median(scatter[weights[3, k] > 0])) if weights[3, k].any() else 0.0
         # Below the usual noise no change is of interest.
         values[3, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2 + 1e-12))
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
-    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half > 0, lost)
+    swept = tuple(is_sweep(command) for command in course.command)
+    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
 
 
 def _tamed(
@@ -268,6 +270,12 @@ def _regressed(
     weights[weights < INFORMED * typical] = 0
     return estimate.T, weights
 
+
+HALF_CYCLES = 6
+"""Half cycles on either side of a change, at least: three cycles."""
+
+SHORTEST_S = 2.0
+"""Time on either side of a change, at least [s]."""
 
 SHORTEST = 2
 """Blocks of a change, at least: one alone may hold a step of the command that no response fits."""
@@ -328,7 +336,9 @@ def _correlation(values: FloatArray, weights: FloatArray) -> float:
     return min(max(float(np.median(found)), 0.0), 0.95) if found else 0.0
 
 
-def _largest(values: FloatArray, weights: FloatArray, rho: float, tests: int) -> _Run | None:
+def _largest(
+    values: FloatArray, weights: FloatArray, rho: float, tests: int, shortest: int
+) -> _Run | None:
     """Return the most certain run of blocks, or None if none is beyond the level."""
     known = np.flatnonzero(weights > 0)
     v, w = values[known], weights[known]
@@ -337,7 +347,7 @@ def _largest(values: FloatArray, weights: FloatArray, rho: float, tests: int) ->
         return None
     best: tuple[float, _Run] | None = None
     for lasting in (True, False):
-        first, last = _runs(known.size, lasting=lasting)
+        first, last = _runs(known.size, shortest, lasting=lasting)
         if not first.size:
             continue
         change, outside, error = _fitted(v, w, first, last, rho)
@@ -354,15 +364,15 @@ def _largest(values: FloatArray, weights: FloatArray, rho: float, tests: int) ->
     return None if best is None else best[1]
 
 
-def _runs(count: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
+def _runs(count: int, shortest: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
     """Return first block and the one after the last of runs to one end, or within."""
     if lasting:
-        cuts = np.arange(SHORTEST, count - SHORTEST + 1)
+        cuts = np.arange(shortest, count - shortest + 1)
         half = cuts * 2 > count  # the shorter part is what changed
         first = np.where(half, cuts, 0)
         last = np.where(half, count, cuts)
         return first, last
-    first, last = np.triu_indices(count, SHORTEST)
+    first, last = np.triu_indices(count, shortest)
     inner = (first > 0) & (last < count) & ((last - first) * 2 <= count)
     return first[inner], last[inner]
 

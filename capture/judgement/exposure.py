@@ -89,14 +89,15 @@ def exposure_of(
     for k, response in enumerate(responses):
         group = [j for j, number in enumerate(like) if number == like[k]]
         sound = [responses[j] for j in group if responds(responses[j])]
-        common = median_response(sound) if len(group) >= ENOUGH_LIKE and sound else Response(1.0)
+        others = [j for j in range(len(motions)) if j != k]
+        if len(group) >= ENOUGH_LIKE and sound:
+            common = median_response(sound)
+        else:
+            common = Response(_usual_gain([responses[j] for j in others]))
         offset = response.offset_rad
         healthy[k] = offset + common.gain * filtered[k].output(common)[0]
-        others = [j for j in range(len(motions)) if j != k]
-        if len(group) >= ENOUGH_LIKE:
-            pooled = float(np.median(lost[group]))
-        else:  # of joints unlike each other the worst may be the one that is like it
-            pooled = float(np.max(lost[others])) if others else float(LARGEST_REST_RAD)
+        pool = group if len(group) >= ENOUGH_LIKE else others
+        pooled = float(np.median(lost[pool])) if pool else float(LARGEST_REST_RAD)
         rest[k] = min(pooled, float(LARGEST_REST_RAD))
         known = sound or [r for r in responses if responds(r)]
         settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
@@ -104,6 +105,17 @@ def exposure_of(
     least = np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own)
     settling += course.step_s
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
+
+
+def _usual_gain(others: Sequence[Response]) -> float:
+    """Return the gain to ask of a joint without like joints: 1, or less where most others give less.
+
+    The joints of a body too heavy for its motors follow by less, and none of them is at fault.
+    """
+    gains = [response.gain for response in others if response.explained >= COHERENT]
+    if len(gains) < ENOUGH_LIKE - 1:
+        return 1.0
+    return min(1.0, max(float(np.median(gains)), RESPONDS))
 
 
 def responds(response: Response) -> bool:

@@ -127,7 +127,8 @@ class RestsOff:
     Attributes:
         offset_rad: Position less command at rest, the largest [rad].
         range_rad: The least and the largest [rad].
-        rests: Number of rests.
+        rests: Number of rests; 0 where the command never rests: then the offset is the median of
+            all times.
     """
 
     joint: str
@@ -138,6 +139,9 @@ class RestsOff:
     @property
     def text(self) -> str:
         """E.g. ``rests up to 4.2 degrees off its command``."""
+        if not self.rests:
+            place = "below" if self.offset_rad < 0 else "above"
+            return f"is {abs(math.degrees(self.offset_rad)):.2g} degrees {place} its command"
         return f"rests up to {abs(math.degrees(self.offset_rad)):.2g} degrees off its command"
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
 from .bursts import find_bursts
-from .changes import WIDTH, Jump, find_jumps
+from .changes import SHORTEST_S, WIDTH, Jump, find_jumps
 from .exposure import (
     COHERENT,
     ENOUGH_LIKE,
@@ -36,7 +36,7 @@ from .record import record_faults
 from .response import BLOCKS, Response, fit_response
 from .rests import find_rests
 from .standing import opposite_kinds, standing_kinds
-from .stillness import Stillness, stillness_of, usable_steps
+from .stillness import Stillness, runs_of, stillness_of, usable_steps
 
 WHOLE = 2 / 3
 """Share of its exposed time from which a fault holds throughout: what the trimmed response can't
@@ -47,10 +47,6 @@ UNIT_SLACK = 1.6
 
 ORDERLY = 0.8
 """Explained share of the other joints beside which one that follows nothing stands out."""
-
-SHORTEST_S = 2.0
-"""A shorter record is not judged [s]: it is the time on either side of a change that a size of it
-needs."""
 
 RESOLVED = 8
 """Samples of a cycle, at least: linear interpolation between them errs by 1 - cos(pi/8) = 8 %."""
@@ -276,12 +272,6 @@ def _alone(stands: BoolArray, common: BoolArray) -> BoolArray:
         if 2 * int(common[first:last].sum()) > last - first:
             result[first:last] = False
     return result
-
-
-def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return the first index and the one after the last of each run of marks."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _gain_is(exposure: Exposure, k: int, factor: float) -> bool:

@@ -28,6 +28,9 @@ TAPERS = 8
 NEIGHBOURS = 2
 """How many times the line of like joints a line is, at least, to be a joint's own."""
 
+HARMONICS = 10
+"""Multiples of a gait's frequency at which friction moves a joint: as 1/n^2, to 1 % of the gait."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -66,7 +69,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
         common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
-        least = max(float(ANGLE_MARGIN_RAD), REST_ERRORS * _rest_within(exposure, k))
+        least = _least_rad(frequency, course, exposure, k)
         sure = (tail[k] < LEVEL / tests) & (amplitude[k] > least)
         sure &= (amplitude[k] > NEIGHBOURS * common) & _free(
             frequency, course, k, like=len(others) > 2
@@ -77,9 +80,20 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     return lines
 
 
-def _rest_within(exposure: Exposure, k: int) -> float:
-    """Return the rest error of a joint where it isn't shared by like joints, else 0."""
-    return float(exposure.rest_rad[k]) if len(exposure.group(k)) == 1 else 0.0
+def _least_rad(
+    frequency: FloatArray, course: Course, exposure: Exposure, k: int
+) -> FloatArray:
+    """Return the amplitude of a line that matters, at each frequency [rad].
+
+    Unless like joints share it, three rest errors up to the last harmonic of the motion's own
+    frequency: there play and stick move a joint.
+    """
+    motion = exposure.fitted[k] - np.mean(exposure.fitted[k])
+    rate = np.gradient(motion, course.step_s)
+    slow = float(np.linalg.norm(rate)) / max(2 * np.pi * float(np.linalg.norm(motion)), 1e-300)
+    rest = REST_ERRORS * exposure.rest_rad[k] if len(exposure.group(k)) == 1 else 0.0
+    least = np.where(frequency <= HARMONICS * slow, rest, 0.0)
+    return np.maximum(least, ANGLE_MARGIN_RAD)
 
 
 def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolArray:
@@ -91,7 +105,8 @@ def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolA
     free = frequency > 2 * resolved
     cycle = cycle_s(course.command[k], course.step_s)
     if np.isfinite(cycle) and not like:
-        free &= np.abs(frequency - np.round(frequency * cycle) / cycle) > resolved
+        harmonic = np.round(frequency * cycle)
+        free &= (np.abs(frequency - harmonic / cycle) > resolved) | (harmonic > HARMONICS)
     return np.asarray(free, dtype=np.bool_)
 
 

@@ -20,6 +20,9 @@ ALIKE = 2
 """Ratio of long to short cycles (90 and 10 %) of a rhythm at most: a gait that changes its pace by
 more is several gaits."""
 
+SWEPT = 0.9
+"""Rank correlation of a cycle's length with its number from which a command is a sweep."""
+
 HYSTERESIS = 10
 """Share of the range about its middle that is no crossing, inverse: noise is less than that."""
 
@@ -174,3 +177,12 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
     lengths = np.diff(rises)
     short, long = np.quantile(lengths, (0.1, 0.9))
     return float(np.median(lengths)) * step_s if long <= ALIKE * short else float("inf")
+
+
+def is_sweep(command: FloatArray) -> bool:
+    """Return whether the cycles of a command of shape (n,) get shorter, or longer, all along."""
+    lengths = np.diff(rises_of(command))
+    if lengths.size < 3 or lengths.min() == lengths.max():
+        return False
+    ranks = np.unique(lengths, return_inverse=True)[1]
+    return bool(abs(np.corrcoef(ranks, np.arange(lengths.size))[0, 1]) > SWEPT)

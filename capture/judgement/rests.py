@@ -1,8 +1,10 @@
 """Where a joint rests off its command, as soft servos under load do.
 
 The command rests where it moves less than an encoder would show for longer than the settling; the
-mean of the position less the command there, over the rests of a session, is the rest's error. It is
-a difference, no fault: proportional control without an integral part leaves it.
+mean of the position less the command there, over the rests of a session, is the rest's error. Of a
+command that never rests it is the median of position less command over all times, where no like
+joints tell more. It is a difference, no fault: proportional control without an integral part leaves
+it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ class RestOff:
         joint: Its index.
         offset_rad: The largest position less command at rest [rad].
         range_rad: The least and the largest of the rests [rad].
-        rests: Number of rests.
+        rests: Number of rests; 0 where the command never rests.
     """
 
     joint: int
@@ -42,11 +44,13 @@ def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list
     found: list[RestOff] = []
     for k in range(course.position.shape[0]):
         off = _rests(course, exposure, stillness, k)
-        if not off:
-            continue
-        most = max(off, key=abs)
+        rests = len(off)
+        if not off and len(exposure.group(k)) == 1:
+            kept = course.present[k] & ~stillness.stands[k]
+            off = [float(np.median((course.position[k] - course.command[k])[kept]))]
+        most = max(off, key=abs, default=0.0)
         if abs(most) > LARGEST_REST_RAD:
-            found.append(RestOff(k, most, (min(off), max(off)), len(off)))
+            found.append(RestOff(k, most, (min(off), max(off)), rests))
     return found
 
 
