@@ -231,7 +231,7 @@ class Answer:
         extra: Motion at frequencies that aren't the commands'.
         rests: Joints that rest off their command.
         stand_out: Joints that stand out, worst first.
-        undecided: Why it can't be decided which joint differs, or None.
+        undecided: Why it can't be decided which joint differs, or what else may; None otherwise.
         shape: Shapes of the rest, those that explain most first; each simultaneous interval
             excludes zero.
         alike: Whether all commanded joints are shown to be alike; None where it is open.

@@ -26,9 +26,6 @@ NAMED = 4
 """Joints that a sentence names at most; the others are counted."""
 
 _FLAGGED = 6
-_NEGLIGIBLE = {"gain": 5e-4, "lag": math.radians(0.05)}
-"""Shapes smaller than this are left to the tables."""
-
 _KIND_WORDS = {
     "at_limit": "at a limit",
     "swapped": "swapped with another joint",
@@ -95,7 +92,7 @@ def compose(facts: Facts) -> Answer:
         extra=facts.judgement.extra,
         rests=facts.judgement.rests,
         stand_out=findings.stand_out,
-        undecided=_undecided(facts) or None,
+        undecided=_undecided(facts) or _boundary(facts) or None,
         shape=findings.shape,
         alike=alike,
         compared=len(set(findings.compared)),
@@ -175,7 +172,9 @@ def _named(facts: Facts) -> str:
         by_joint.setdefault(each.joint, []).append(each)
     for joint, several in list(by_joint.items())[:NAMED]:
         sizes = " and ".join(deviation_in_words(each) for each in several)
-        clauses.append(f"{plain(joint)} responds differently from the others, {sizes}")
+        clause = f"{plain(joint)} responds differently from the others, {sizes}"
+        end = joint in _ends(facts, several[0].plane, several[0].group)
+        clauses.append(f"{clause}: the joint or the boundary" if end else clause)
     clauses += facts.findings.kinds
     if len(by_joint) > NAMED:
         names = [plain(joint) for joint in list(by_joint)[NAMED:]]
@@ -202,6 +201,25 @@ def _undecided(facts: Facts) -> str:
         return ""
     word = _joints_word(facts, *facts.findings.undecided[0])
     return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
+
+
+def _ends(facts: Facts, plane: str, group: int) -> tuple[str, ...]:
+    """Return the first and the last of the compared joints of a plane and rhythm."""
+    compared = set(facts.findings.compared)
+    names = [
+        joint.name
+        for joint in facts.joints
+        if joint.name in compared and (joint.plane or "chain", joint.group) == (plane, group)
+    ]
+    return (names[0], names[-1]) if len(names) > 1 else ()
+
+
+def _boundary(facts: Facts) -> str:
+    """Say which joints or boundaries make the ends differ, and what decides; empty for none."""
+    pairs = [f"{plain(first)} and {plain(last)}" for first, last in facts.findings.boundary]
+    if not pairs:
+        return ""
+    return f"the boundary or {', '.join(pairs)}: reverse, swap modules, or compare with an earlier session"
 
 
 def deviation_in_words(each: StandOut) -> str:
@@ -345,12 +363,12 @@ def _shapes(facts: Facts) -> str:
                 each
                 for each in facts.findings.shape
                 if (each.plane, each.group, each.quantity) == (plane, group, quantity)
-                and abs(each.value) >= _NEGLIGIBLE[quantity]
             ]
             shaped = [each for each in own if each.kind != "each"]
             ends = [each for each in shaped if each.kind == "ends"]
             clauses += [_shape(each, word) for each in (ends or shaped or own)[:1]]
-    return "; ".join(clauses)
+    boundary = _boundary(facts)
+    return f"{'; '.join(clauses)} ({boundary})" if boundary else "; ".join(clauses)
 
 
 def _shape(shape: Shape, joints: str) -> str:

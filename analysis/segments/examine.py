@@ -15,7 +15,7 @@ from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivale
 from ..response.response import Response
 from ..results.answer import Shape, StandOut
 from .kinds import Split, split_of
-from .outliers import Deviation, standing_out
+from .outliers import LOCAL, Deviation, standing_out
 from .profile import (
     LEVEL,
     MIN_JOINTS,
@@ -80,6 +80,7 @@ class Findings:
         alike: Whether the rest of the compared joints is shown to be alike; None where it isn't.
         compared: Names of the joints that were compared.
         kinds: Two kinds of joints, a clause each, where there are such.
+        boundary: First and last joints that differ from the middle as no others do.
     """
 
     stand_out: tuple[StandOut, ...] = ()
@@ -88,6 +89,7 @@ class Findings:
     alike: bool | None = None
     compared: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
+    boundary: tuple[tuple[str, str], ...] = ()
 
 
 def examine(chains: Iterable[Chain]) -> Findings:
@@ -113,6 +115,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
     out: list[StandOut] = []
     shapes: list[tuple[float, Shape]] = []
     undecided: dict[tuple[str, int], None] = {}
+    boundary: dict[tuple[str, str], None] = {}
     excluded: dict[int, set[int]] = {id(chain): set() for chain in some}
     for chain, quantity, profile in profiles:
         if len(chain.names) < MIN_JOINTS:
@@ -131,27 +134,39 @@ def examine(chains: Iterable[Chain]) -> Findings:
         found = [
             each
             for each in contrasts(profile, active)
-            if abs(each.value) > critical * each.error
+            if abs(each.value) > max(critical * each.error, profile.margin - critical * each.error)
             and (each.kind == "each" or each.spread**2 >= half)
         ]
         if len(chain.names) < MIN_JOINTS:
             if found:
                 undecided[chain.plane, chain.group] = None
             continue
+        if any(each.kind == "ends" for each in found) and _spikes(profile.values[active]):
+            names = [name for name, there in zip(chain.names, active, strict=True) if there]
+            boundary[names[0], names[-1]] = None
         shapes += [
             (each.spread / _MARGINS[quantity], _shape(chain, quantity, each, critical))
             for each in found
         ]
     alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)
+    alike = alike and not (shapes or kinds)
     out.sort(key=lambda each: -abs(each.deviation) / _MARGINS.get(each.quantity, OFFSET_RAD))
     return Findings(
         stand_out=_ranked(out),
         shape=tuple(shape for _, shape in sorted(shapes, key=lambda each: -each[0])),
         undecided=tuple(undecided),
-        alike=True if alike and not kinds else None,
+        alike=True if alike else None,
+        boundary=tuple(boundary),
         kinds=tuple(kinds),
         compared=tuple(name for chain in some for name in chain.names),
     )
+
+
+def _spikes(values: FloatArray) -> bool:
+    """Return whether the joints beside the ends don't follow the ends away from the middle."""
+    away = values - np.median(values[2:-2])
+    beside = max(abs(float(away[1])), abs(float(away[-2])))
+    return beside < LOCAL * abs(float(away[0] + away[-1])) / 2
 
 
 def _by_kind(chain: Chain) -> tuple[list[Chain], str]:
@@ -239,10 +254,12 @@ def _alike(chain: Chain, excluded: set[int]) -> bool:
     index = [k for k in range(len(chain.names)) if k not in excluded]
     if len(index) < 2:
         return False
-    rows = np.eye(len(index)) - 1 / len(index)
+    # Each joint less the mean of the others.
+    count = len(index)
+    rows = (count * np.eye(count) - 1) / (count - 1)
     for quantity, margin in _MARGINS.items():
         profile = profile_of(chain, quantity)
-        values = profile.values[index] - profile.values[index].mean()
+        values = rows @ profile.values[index]
         scatter = profile.scatter.select(index)
         error = np.sqrt(scatter.variance(rows))
         dof = float(scatter.columns.shape[1])

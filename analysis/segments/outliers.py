@@ -39,9 +39,9 @@ MIRRORED = 0.5
 LOCAL = 0.5
 """Share of a deviation that a joint shows beside its neighbours at least, out of a profile."""
 
-CHANCE = 0.005
+CHANCE = 0.01
 """Chance that of joints of equal scatter one is taken to stand out, before the searches choose the
-rest that it is held against: with that it is 0.6 to 2 % for 6 to 13 joints."""
+rest that it is held against: with that it is 1 to 4 % for 6 to 13 joints."""
 
 ROUGH = 2.0
 """Residuals of the rest so many times their standard error are a profile of its own."""
@@ -247,8 +247,9 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
 
 
 def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
-    """Return whether a deviation exceeds its interval, the margin and the others' residuals."""
-    if abs(one.value) <= max(critical * one.error, profile.margin):
+    """Return whether a deviation exceeds its interval, which reaches the margin, and the others'."""
+    half = critical * one.error
+    if abs(one.value) <= max(half, profile.margin - half):
         return False
     others = state.active.copy()
     others[one.joint] = False

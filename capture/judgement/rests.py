@@ -46,8 +46,9 @@ def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list
         off = _rests(course, exposure, stillness, k)
         rests = len(off)
         if not off and len(exposure.group(k)) == 1:
-            kept = course.present[k] & ~stillness.stands[k]
-            off = [float(np.median((course.position[k] - course.command[k])[kept]))]
+            error = course.position[k] - course.command[k]
+            kept = error[course.present[k] & ~stillness.stands[k]]
+            off = [float(np.median(kept))] if kept.size else []
         most = max(off, key=abs, default=0.0)
         if abs(most) > LARGEST_REST_RAD:
             found.append(RestOff(k, most, (min(off), max(off)), rests))
