@@ -250,9 +250,12 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
 
 
 def _alike(chain: Chain, excluded: set[int]) -> bool:
-    """Return whether the equivalence tests of gain and lag pass for the rest of a chain."""
+    """Return whether the equivalence tests of gain and lag pass for the rest of a chain.
+
+    Of fewer joints than can say which one differs nothing is claimed.
+    """
     index = [k for k in range(len(chain.names)) if k not in excluded]
-    if len(index) < 2:
+    if len(index) < MIN_JOINTS - 1 or len(chain.names) < MIN_JOINTS:
         return False
     # Each joint less the mean of the others.
     count = len(index)

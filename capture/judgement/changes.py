@@ -122,10 +122,14 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     for q, quantity in enumerate(QUANTITIES):
         values, weights = blocks.values[q], blocks.weights[q]
         values, weights = _without_common(values, weights, exposure)
+        values, weights = _without_single(values, weights), _limited(weights)
         rho = _correlation(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
         for k in range(weights.shape[0]):
-            run = _largest(values[k], weights[k], rho, tests, blocks.shortest)
+            compared = len(exposure.group(k)) >= ENOUGH_LIKE
+            run = _largest(
+                values[k], weights[k], rho, tests, blocks.shortest, compared=compared
+            )
             if run is None or not _matters(quantity, k, exposure, run, blocks):
                 continue
             # Noise is what no other quantity explains.
@@ -266,8 +270,7 @@ def _regressed(
         [1 / np.maximum(np.diagonal(inverse, axis1=1, axis2=2).T, 1e-300), [count]]
     )
     weights[:, count < FULL * width] = 0
-    typical = np.median(weights, axis=1, keepdims=True)
-    weights[weights < INFORMED * typical] = 0
+    weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
     return estimate.T, weights
 
 
@@ -284,7 +287,7 @@ RIDGE = 1e-3
 """Ridge on gain and lag, relative to the median block: 0.1 % of what is known of them is lost."""
 
 INFORMED = 0.1
-"""Share of the median block's information below which a block is left out."""
+"""Share of the information of the best blocks below which a block is left out."""
 
 
 def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray) -> float:
@@ -322,6 +325,28 @@ def _without_common(
     return result, compared
 
 
+def _without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Replace each block by the median of it and its neighbours: one alone is no change."""
+    result = values.copy()
+    for row, weight in zip(result, weights, strict=True):
+        known = np.flatnonzero(weight > 0)
+        if known.size >= FEWEST:
+            inner = row[known]
+            three = np.stack([inner[:-2], inner[1:-1], inner[2:]])
+            middle = np.median(three, axis=0)
+            row[known] = np.concatenate([middle[:1], middle, middle[-1:]])
+    return result
+
+
+def _limited(weights: FloatArray) -> FloatArray:
+    """Limit weights: what a model leaves doesn't fall with what a block tells.
+
+    With the variance of the median block's noise in each block beside its own.
+    """
+    usual = np.array([np.median(row[row > 0]) if row.any() else 1.0 for row in weights])[:, None]
+    return weights * usual / (weights + usual)
+
+
 def _correlation(values: FloatArray, weights: FloatArray) -> float:
     """Return the correlation from block to block of the median joint."""
     found: list[float] = []
@@ -337,9 +362,20 @@ def _correlation(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _largest(
-    values: FloatArray, weights: FloatArray, rho: float, tests: int, shortest: int
+    values: FloatArray,
+    weights: FloatArray,
+    rho: float,
+    tests: int,
+    shortest: int,
+    *,
+    compared: bool,
 ) -> _Run | None:
-    """Return the most certain run of blocks, or None if none is beyond the level."""
+    """Return the most certain run of blocks, or None if none is beyond the level.
+
+    Args:
+        compared: Whether like joints have taken off what a model leaves: then what is left is
+            chance, and the plain difference of means must be beyond it, too.
+    """
     known = np.flatnonzero(weights > 0)
     v, w = values[known], weights[known]
     # So many blocks of one weight know as much.
@@ -351,6 +387,8 @@ def _largest(
         if not first.size:
             continue
         change, outside, error = _fitted(v, w, first, last, rho)
+        if compared:
+            error = np.maximum(error, _plain_error(v, w, first, last, rho))
         limit = -float(stdtrit(known.size - 3, LEVEL / 4 / tests / first.size))
         t = np.abs(change) / error
         k = int(np.argmax(t))
@@ -359,9 +397,27 @@ def _largest(
             stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
             inner = float(w[first[k] : last[k]].sum())
             drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
-            run = _Run(float(change[k]), float(outside[k]), float(error[k]), start, stop, drop)
+            means = _means(v, w, int(first[k]), int(last[k]))
+            size = float(change[k]) if means is None else means[0] - means[1]
+            run = _Run(size, float(outside[k]), float(error[k]), start, stop, drop)
             best = t[k] / limit, run
     return None if best is None else best[1]
+
+
+def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, float] | None:
+    """Return the means in and out of a run, without the blocks at its ends, which hold both.
+
+    None where too few blocks are left.
+    """
+    begins, ends = first > 0, last < v.size
+    inside = np.zeros(v.size, dtype=np.bool_)
+    inside[first + begins : last - ends] = True
+    outside = np.ones(v.size, dtype=np.bool_)
+    outside[max(first - begins, 0) : last + ends] = False
+    if not (inside.any() and outside.any()):
+        return None
+    within, beyond = (float(w[part] @ v[part] / w[part].sum()) for part in (inside, outside))
+    return within, beyond
 
 
 def _runs(count: int, shortest: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
@@ -399,6 +455,18 @@ def _fitted(
     left = float(target @ target) - total**2 / level - change**2 * free
     variance = np.maximum(left, 1e-300) / max(v.size - 3, 1) / free
     return change, (total - change * along) / level, np.sqrt(variance)
+
+
+def _plain_error(
+    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
+) -> FloatArray:
+    """Return the standard error of the difference of means in and out of runs."""
+    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
+    inside = sums[:, last] - sums[:, first]
+    (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
+    squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
+    freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
+    return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), 1e-300))
 
 
 def _whitened(values: FloatArray, rho: float) -> FloatArray:

@@ -8,7 +8,7 @@ difference and no fault.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 
 import numpy as np
@@ -30,13 +30,13 @@ from .exposure import (
 )
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .lines import find_lines
-from .motion import Course, JointMotion, course_of, rises_of
-from .naming import Verdict, in_words, permutation_of
+from .motion import Course, JointMotion, course_of, cycle_s, rises_of, runs_of
+from .naming import Kind, Verdict, in_words, permutation_of
 from .record import record_faults
-from .response import BLOCKS, Response, fit_response
+from .response import BLOCKS, LATEST_S, Response, fit_response
 from .rests import find_rests
 from .standing import opposite_kinds, standing_kinds
-from .stillness import Stillness, runs_of, stillness_of, usable_steps
+from .stillness import Stillness, stillness_of, usable_steps
 
 WHOLE = 2 / 3
 """Share of its exposed time from which a fault holds throughout: what the trimmed response can't
@@ -47,6 +47,9 @@ UNIT_SLACK = 1.6
 
 ORDERLY = 0.8
 """Explained share of the other joints beside which one that follows nothing stands out."""
+
+MOVING = frozenset({"swapped", "inverted", "inverted_sensor", "noisy_sensor"})
+"""Kinds of a joint that moves, though not as commanded."""
 
 RESOLVED = 8
 """Samples of a cycle, at least: linear interpolation between them errs by 1 - cos(pi/8) = 8 %."""
@@ -75,9 +78,11 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     responses = in_threads(response_of, range(len(driven)), samples)
     exposure = exposure_of(course, driven, responses)
     stillness = stillness_of(course, exposure)
-    faults = _faults(course, driven, exposure, stillness)
-    names_clause, swapped = _naming(course, driven, exposure)
-    faults |= swapped
+    names_clause = _late_or_opposite(course, exposure)
+    faults = _faults(course, driven, exposure, stillness, ordered=not names_clause)
+    if not names_clause:
+        names_clause, swapped = _naming(course, driven, exposure, faults)
+        faults |= swapped
     for name, fault in record.items():
         # Missing samples are no reason for anything else; a counter's turns and old values are.
         if name not in faults or fault.kinds != ("lost_samples",):
@@ -139,10 +144,34 @@ def _lasts(motion: JointMotion) -> bool:
     return bool(np.count_nonzero((position >= start) & (position <= stop)) >= BLOCKS)
 
 
+def _late_or_opposite(course: Course, exposure: Exposure) -> str:
+    """Say what can't be told of a rhythm that all joints answer late by half a cycle.
+
+    A delay within :data:`.response.LATEST_S` is a healthy joint's; empty where that explains less.
+    """
+    lags: list[float] = []
+    for command, response in zip(course.command, exposure.responses, strict=True):
+        half = cycle_s(command, course.step_s) / 2
+        if response.gain < 0 and response.explained >= ORDERLY and half < LATEST_S:
+            lags.append(half + response.lag_s)
+    if len(lags) <= WHOLE * len(exposure.responses) or np.median(lags) > LATEST_S:
+        return ""
+    return f"all joints move against their commands, or lag by {np.median(lags):.2g} s"
+
+
 def _faults(
-    course: Course, driven: Sequence[JointMotion], exposure: Exposure, stillness: Stillness
+    course: Course,
+    driven: Sequence[JointMotion],
+    exposure: Exposure,
+    stillness: Stillness,
+    *,
+    ordered: bool,
 ) -> dict[str, Fault]:
-    """Return the faults of joints that had to move, by name."""
+    """Return the faults of joints that had to move, by name.
+
+    Args:
+        ordered: Whether it can be told if a joint moves against its command, or by another one.
+    """
     faults: dict[str, Fault] = {}
     explained = np.array([response.explained for response in exposure.responses])
     common = _common_stands(stillness)
@@ -154,10 +183,10 @@ def _faults(
         others = np.append(np.delete(explained, k), 0.0 if explained.size < 2 else explained.max())
         stands = _alone(stillness.stands[k], common)
         share = float(stands.sum()) / max(int(stillness.exposed[k].sum()), 1)
-        if (leader := _leader(course, exposure, k)) is not None:
+        if ordered and (leader := _leader(course, exposure, k)) is not None:
             text = f"carries out the command of {driven[leader].name}"
             faults[motion.name] = _whole(motion, ("swapped",), text)
-        elif _is_opposite(course, exposure, k):
+        elif ordered and _is_opposite(course, exposure, k):
             kinds, why = opposite_kinds(motion)
             text = f"moves against its command, gain {response.gain:.2f}"
             faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
@@ -169,29 +198,48 @@ def _faults(
             kinds, why = standing_kinds(motion, spans, like)
             if _gain_is(exposure, k, np.radians(1.0)):
                 kinds = (*kinds, "scaled_sensor")
-            if len(spans) > 1 and not {"at_limit"} & {*kinds} and kinds != ("frozen_sensor",):
+            again = len(spans) > 1 and share < WHOLE
+            if again and not {"at_limit"} & {*kinds} and kinds != ("frozen_sensor",):
                 kinds = ("intermittent", *kinds)
             text = _stood(spans, course, k, exposure)
             text = f"{text}; {why}" if why else text
             faults[motion.name] = _fault(motion, kinds, spans, share, text)
         elif _is_incoherent(course, exposure, k) and np.median(others) > ORDERLY:
             text = f"its command explains {100 * response.explained:.0f} % of its motion"
-            faults[motion.name] = _whole(motion, ("dead", "noisy_sensor"), text)
+            low, high = np.quantile(course.position[k], (1 - ORDERLY, ORDERLY))
+            kinds, why = ("noisy_sensor", "dead"), ""
+            if high - low < RESPONDS * float(np.ptp(exposure.healthy[k])):
+                whole = (float(course.t_s[0]), float(course.t_s[-1]))
+                kinds, why = standing_kinds(motion, [whole], like)
+            faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
     return faults
 
 
 def _naming(
-    course: Course, driven: Sequence[JointMotion], exposure: Exposure
+    course: Course,
+    driven: Sequence[JointMotion],
+    exposure: Exposure,
+    faults: Mapping[str, Fault],
 ) -> tuple[str, dict[str, Fault]]:
-    """Ask whether a permutation of the names explains more, where a joint is unlike the others."""
-    sound = [r for r in exposure.responses if responds(r)]
-    odd = len(sound) < len(driven) or not all(agrees(r, median_response(sound)) for r in sound)
+    """Ask whether a permutation of the names explains more, where a joint is unlike the others.
+
+    A joint that stands is unlike them by itself.
+    """
+    moving = [
+        response
+        for motion, response in zip(driven, exposure.responses, strict=True)
+        if motion.name not in faults or MOVING & {*faults[motion.name].kinds}
+    ]
+    sound = [response for response in moving if responds(response)]
+    odd = len(sound) < len(moving) or not all(agrees(r, median_response(sound)) for r in sound)
     if len(driven) < 2 or not odd:
         return "", {}
     naming = permutation_of(course.command.T, course.position.T, course.step_s)
     names = [motion.name for motion in driven]
     if naming.verdict is Verdict.EITHER:
-        return in_words(naming, names), {}
+        named = [one.delay_s for one in naming.alternatives if one.kind is Kind.AS_NAMED]
+        # A lag that servos have is no reason to doubt the names.
+        return "" if named and min(named) <= LATEST_S else in_words(naming, names), {}
     if naming.verdict is not Verdict.PERMUTED or naming.permutation is None:
         return "", {}
     swapped = {
@@ -236,13 +284,7 @@ def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
 
 
 def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
-    """Return the joint whose command explains the motion of another, as its own does not.
-
-    What healthy joints make of a command is known from like joints; without them a joint that
-    responds to its own command may lag as it does.
-    """
-    if len(exposure.group(k)) < ENOUGH_LIKE and responds(exposure.responses[k]):
-        return None
+    """Return the joint whose command explains the motion of another, as its own does not."""
     position: FloatArray = course.position[k]
     position = position - position.mean()
     healthy = exposure.healthy - np.mean(exposure.healthy, axis=1, keepdims=True)
@@ -252,6 +294,8 @@ def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
     rival = min(float(left[k]), opposite)
     if best == k or left[best] > (1 - ORDERLY) * float(np.var(position)):
         return None
+    if responds(exposure.responses[k]):  # a lag or a gain of its own explains as much
+        rival = min(rival, float(np.var(course.position[k] - exposure.fitted[k])))
     if rival < exposure.least_rad[k] ** 2:  # what a healthy joint may lose
         return None
     return best if left[best] < RESPONDS * rival else None

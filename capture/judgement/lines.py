@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
-from .changes import ANGLE_MARGIN_RAD, LEVEL
+from .changes import ANGLE_MARGIN_RAD, LEVEL, WIDTH
 from .exposure import REST_ERRORS, Exposure
 from .motion import Course, cycle_s
 
@@ -61,16 +61,16 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     frequency = np.asarray(np.fft.rfftfreq(padded, course.step_s), dtype=np.float64)
     residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
-    amplitude, tail = np.empty((2, count, frequency.size))
+    amplitude, error, tail = np.empty((3, count, frequency.size))
     for k in range(count):
-        amplitude[k], tail[k] = _tested(residual[k], padded)
+        amplitude[k], error[k], tail[k] = _tested(residual[k], padded)
     tests = count * size
     lines: list[Line] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
         common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
         least = _least_rad(frequency, course, exposure, k)
-        sure = (tail[k] < LEVEL / tests) & (amplitude[k] > least)
+        sure = (tail[k] < LEVEL / tests) & (amplitude[k] + WIDTH * error[k] > least)
         sure &= (amplitude[k] > NEIGHBOURS * common) & _free(
             frequency, course, k, like=len(others) > 2
         )
@@ -110,8 +110,11 @@ def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolA
     return np.asarray(free, dtype=np.bool_)
 
 
-def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray]:
-    """Return amplitude of a line and chance of it without one, at each frequency."""
+def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return amplitude of a line, its standard error, and chance of it without one.
+
+    Each at all frequencies; |a|^2 / F estimates the variance of a part of a.
+    """
     size = residual.size
     steps = np.arange(1, size + 1)
     power = np.zeros(padded // 2 + 1)
@@ -128,4 +131,6 @@ def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray]:
     left = np.maximum(power - projected, 1e-300)
     statistic = (TAPERS - 1) * projected / left
     tail = (1 + statistic / (TAPERS - 1)) ** -(TAPERS - 1)
-    return 2 * np.abs(weighted) / sums, np.asarray(tail, dtype=np.float64)
+    amplitude = 2 * np.abs(weighted) / sums
+    error = amplitude / np.sqrt(np.maximum(statistic, 1e-300))
+    return amplitude, error, np.asarray(tail, dtype=np.float64)

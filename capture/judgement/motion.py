@@ -26,6 +26,9 @@ SWEPT = 0.9
 HYSTERESIS = 10
 """Share of the range about its middle that is no crossing, inverse: noise is less than that."""
 
+LEAST_ASKED_RAD = np.radians(0.5)
+"""Motion of most commands in a pause [rad]: half of the margin of "alike"; less shows nowhere."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -91,7 +94,8 @@ class Course:
         t_s: Times [s], shape (n,).
         command: Commanded positions [rad], shape (k, n).
         position: Measured positions [rad], shape (k, n).
-        present: Where a joint's position was sampled, shape (k, n).
+        present: Where a joint's position was sampled, and no driver repeated what all joints had,
+            shape (k, n).
         asked: Where its command is known, shape (k, n): not in gaps of its record.
         step_s: Time from one step to the next [s].
     """
@@ -122,11 +126,14 @@ def course_of(motions: Sequence[JointMotion]) -> Course | None:
     if step <= 0 or stop - start < 2 * step:
         return None
     t_s = np.asarray(np.arange(start, stop + step / 2, step), dtype=np.float64)
+    command = np.stack([m.command.at(t_s) for m in motions])
+    position = np.stack([m.position.at(t_s) for m in motions])
+    present = np.stack([_present(m, t_s, step) for m in motions])
     return Course(
         t_s,
-        np.stack([m.command.at(t_s) for m in motions]),
-        np.stack([m.position.at(t_s) for m in motions]),
-        np.stack([_present(m, t_s, step) for m in motions]),
+        command,
+        position,
+        present & ~_paused(command, position),
         np.stack([_asked(m.command.t_s, t_s) for m in motions]),
         step,
     )
@@ -141,6 +148,28 @@ def _present(motion: JointMotion, t_s: FloatArray, step_s: float) -> BoolArray:
     close = np.minimum(before, after) <= near
     commanded = (t_s >= motion.command.t_s[0]) & (t_s <= motion.command.t_s[-1] + near)
     return np.asarray(close & commanded, dtype=np.bool_)
+
+
+def _paused(command: FloatArray, position: FloatArray) -> BoolArray:
+    """Mark the steps in which all joints repeat their values though most commands move.
+
+    Nothing came in over the bus meanwhile, and a driver repeated what it had; shape (n,).
+    """
+    paused = np.zeros(position.shape[1], dtype=np.bool_)
+    if position.shape[0] < 2:
+        return paused
+    repeats = np.all(np.diff(position, prepend=np.nan) == 0, axis=0)
+    for first, last in runs_of(repeats):
+        asked = np.ptp(command[:, first - 1 : last], axis=1)
+        if np.median(asked) > LEAST_ASKED_RAD:
+            paused[first:last] = True
+    return paused
+
+
+def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
+    """Return the first index and the one after the last of each run of marks."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:

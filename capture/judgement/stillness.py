@@ -12,15 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
-from .exposure import ENOUGH_LIKE, RESPONDS, Exposure, covered, window_ranges
+from .exposure import RESPONDS, Exposure, covered, window_ranges
 from .motion import Course, cycle_s
 from .response import SETTLED
 
 FULL = 0.9
 """Share of its samples that a window needs: of fewer it isn't known how far the joint moved."""
-
-LEAST_ASKED_RAD = np.radians(0.5)
-"""Motion of most commands in a pause [rad]: half of the margin of "alike"; less shows nowhere."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ def _gain(exposure: Exposure, k: int) -> float:
 def usable_steps(course: Course, exposure: Exposure, stillness: Stillness) -> BoolArray:
     """Return where a joint can be compared with its response, shape (k, n).
 
-    Not where it stands, nor where all joints repeat their values, nor before its response to what was commanded before the record, or in a
+    Not where it stands, nor before its response to what was commanded before the record, or in a
     gap of it, is over, nor in the first cycle, in which play takes its side.
     """
     settled_s = [
@@ -98,30 +95,7 @@ def usable_steps(course: Course, exposure: Exposure, stillness: Stillness) -> Bo
             for asked, settled in zip(course.asked, settled_s, strict=True)
         ]
     )
-    usable = course.present & begun & ~unknown & ~stillness.stands & ~_paused(course)
-    return np.asarray(usable, dtype=np.bool_)
-
-
-def _paused(course: Course) -> BoolArray:
-    """Mark the steps in which all joints repeat their values though most commands move.
-
-    Nothing came in over the bus meanwhile, and a driver repeated what it had; shape (n,).
-    """
-    paused = np.zeros(course.t_s.size, dtype=np.bool_)
-    if course.position.shape[0] < ENOUGH_LIKE:
-        return paused
-    repeats = np.all(np.diff(course.position, prepend=np.nan) == 0, axis=0)
-    for first, last in runs_of(repeats):
-        asked = np.ptp(course.command[:, first - 1 : last], axis=1)
-        if np.median(asked) > LEAST_ASKED_RAD:
-            paused[first:last] = True
-    return paused
-
-
-def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return the first index and the one after the last of each run of marks."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+    return np.asarray(course.present & begun & ~unknown & ~stillness.stands, dtype=np.bool_)
 
 
 def _first_cycle_s(command: FloatArray, course: Course) -> float:
