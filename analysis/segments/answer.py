@@ -219,7 +219,8 @@ def _boundary(facts: Facts) -> str:
     pairs = [f"{plain(first)} and {plain(last)}" for first, last in facts.findings.boundary]
     if not pairs:
         return ""
-    return f"the boundary or {', '.join(pairs)}: reverse, swap modules, or compare with an earlier session"
+    what_decides = "reverse, swap modules, or compare with an earlier session"
+    return f"the boundary or {', '.join(pairs)}: {what_decides}"
 
 
 def deviation_in_words(each: StandOut) -> str:

@@ -247,7 +247,10 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
 
 
 def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
-    """Return whether a deviation exceeds its interval, which reaches the margin, and the others'."""
+    """Return whether a deviation exceeds its interval and the others' residuals.
+
+    The interval isn't within the margin.
+    """
     half = critical * one.error
     if abs(one.value) <= max(half, profile.margin - half):
         return False

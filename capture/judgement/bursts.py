@@ -11,10 +11,10 @@ import numpy as np
 from scipy.special import bdtrc
 
 from ..common.arrays import BoolArray, FloatArray
-from .changes import FEWEST, ROBUST, TAME
 from .exposure import COHERENT, ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
 from .motion import Course, cycle_s
 from .record import RARE
+from .shifts import FEWEST, ROBUST, TAME
 
 FEW = 0.003
 """Share of far samples that any joint may have: lost packets that a driver fills, a few in a

@@ -3,16 +3,8 @@
 The residual of a joint's response is regressed, in blocks of time, on one, on the response and on
 its rate: offset, relative gain and lag of each block; the logarithm of what is left is its noise.
 Where there are like joints, their median in the same block is taken off: what all do is no joint's
-change. The estimates v_i of b blocks, of weights w_i, are a level and one run of blocks beside it,
-
-    v_i = m + c 1(i in run) + s n_i / sqrt(w_i),                                             (1)
-
-with n an autoregression of the correlation rho from block to block, of which the median over the
-joints is taken, its bias of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi
-10.1093/biomet/41.3-4.390). Generalised least squares gives c and its error for each run (Prais &
-Winsten, Cowles Commission 383, 1954); c over its error has Student's distribution. Level: half for
-the lasting changes, of which there are about b a joint and quantity, half for the passing ones,
-b^2/2 (Bonferroni).
+change. A change is a shift of one of the four for a run of blocks, or a drift of the offset
+(:mod:`.shifts`).
 """
 
 from __future__ import annotations
@@ -21,18 +13,22 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-from scipy.special import stdtrit
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from .exposure import ENOUGH_LIKE, Exposure
 from .motion import Course, cycle_s, is_sweep
+from .shifts import (
+    FEWEST,
+    ROBUST,
+    TAME,
+    Shift,
+    correlation_of,
+    drift_of,
+    largest_shift,
+    limited_weights,
+    without_single,
+)
 from .stillness import FULL
-
-LEVEL = 0.01
-"""Chance of any change in a session of healthy joints."""
-
-FEWEST = 8
-"""Blocks that a comparison needs (with fewer, 1 % of all changes has no threshold)."""
 
 MOST = 64
 """Blocks that a course is divided into at most: onsets to 1.6 % of the record."""
@@ -58,7 +54,7 @@ class Jump:
 
     Attributes:
         joint: Its index.
-        quantity: Of :data:`QUANTITIES`.
+        quantity: Of :data:`QUANTITIES`, or ``drift`` of the offset.
         change: From before to after: [rad], relative to before, [s], logarithm of the ratio.
         error: Its standard error.
         first_s: When it changed [s].
@@ -73,18 +69,6 @@ class Jump:
     first_s: float
     last_s: float
     block_s: float
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A run of blocks ``first`` to ``last`` (exclusive) and how it differs from the others."""
-
-    change: float
-    outside: float  # mean of the others
-    error: float
-    first: int
-    last: int
-    drop: float  # of the sum of squares
 
 
 @dataclass(frozen=True)
@@ -119,31 +103,33 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     if blocks is None:
         return []
     best: dict[int, tuple[float, Jump]] = {}
+
+    def offer(k: int, quantity: str, shift: Shift | None) -> None:
+        if shift is None or not _matters(quantity, k, exposure, shift, blocks):
+            return
+        drop = 0.0 if quantity == "noise" else shift.drop  # it is what no other quantity explains
+        if k not in best or drop > best[k][0]:
+            best[k] = drop, _jump(k, quantity, shift, blocks.edges_s)
+
     for q, quantity in enumerate(QUANTITIES):
-        values, weights = blocks.values[q], blocks.weights[q]
-        values, weights = _without_common(values, weights, exposure)
-        values, weights = _without_single(values, weights), _limited(weights)
-        rho = _correlation(values, weights)
+        values, weights = _without_common(blocks.values[q], blocks.weights[q], exposure)
+        values, weights = without_single(values, weights), limited_weights(weights)
+        rho = correlation_of(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
-        for k in range(weights.shape[0]):
+        for k, (value, weight) in enumerate(zip(values, weights, strict=True)):
             compared = len(exposure.group(k)) >= ENOUGH_LIKE
-            run = _largest(
-                values[k], weights[k], rho, tests, blocks.shortest, compared=compared
-            )
-            if run is None or not _matters(quantity, k, exposure, run, blocks):
-                continue
-            # Noise is what no other quantity explains.
-            drop = 0.0 if quantity == "noise" else run.drop
-            if k not in best or drop > best[k][0]:
-                best[k] = drop, _jump(k, quantity, run, blocks.edges_s)
+            shift = largest_shift(value, weight, rho, tests, blocks.shortest, compared=compared)
+            offer(k, quantity, shift)
+            if quantity == "offset":
+                offer(k, "drift", drift_of(value, weight, rho, tests))
     return [best[k][1] for k in sorted(best)]
 
 
-def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
+def _jump(k: int, quantity: str, run: Shift, edges_s: FloatArray) -> Jump:
     """Turn a run of blocks into a change; one that begins the record is undone at its end."""
     change, before, first, last = run.change, run.outside, run.first, run.last
     count = edges_s.size - 1
-    if first == 0:
+    if first == 0 and last < count:
         change, before, first, last = -change, before + change, last, count
     if quantity == "gain":
         change /= 1 + before
@@ -158,19 +144,19 @@ def _jump(k: int, quantity: str, run: _Run, edges_s: FloatArray) -> Jump:
     )
 
 
-def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Blocks) -> bool:
+def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blocks) -> bool:
     """Return whether a change is one that matters: its interval isn't within the margin.
 
     Without like joints, and where the motion is no rhythm, it is also beyond what a response leaves
-    of the joint's motion, and the command is no sweep: play, stick and poles beyond two make another
-    gain of every other motion.
+    of the joint's motion, and the command is no sweep: play, stick and poles beyond two make
+    another gain of every other motion.
     """
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
         return not alone and _reaches(run, float(NOISE_MARGIN))
     lost = float(blocks.lost_rad[k]) if alone else 0.0
-    if quantity == "offset":
+    if quantity in ("offset", "drift"):
         return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
     inside = slice(run.first, run.last)
     _, motion, rate, count = blocks.weights[:, k]
@@ -186,7 +172,7 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: _Run, blocks: _Bloc
     return _reaches(run, margin) and abs(run.change) > lost / speed
 
 
-def _reaches(run: _Run, margin: float) -> bool:
+def _reaches(run: Shift, margin: float) -> bool:
     """Return whether the 95 % interval of a change, that excludes 0, isn't within a margin."""
     return abs(run.change) + WIDTH * run.error > margin
 
@@ -240,14 +226,6 @@ def _tamed(
     result = residual.copy()
     result[: count * width] = np.nan_to_num(limited).ravel()
     return result, scale[:, 0]
-
-
-ROBUST = 1.4826
-"""Standard deviation of normal values in their median distance from the middle."""
-
-TAME = 4
-"""Robust standard deviations of a block beyond which a sample has no more weight: of normal noise
-6 in 100,000 are, and single samples of heavy tails decide nothing (Huber)."""
 
 
 def _regressed(
@@ -323,155 +301,3 @@ def _without_common(
         result[k, enough] -= np.nanmedian(known[:, enough], axis=0)
         compared[k, ~enough] = 0
     return result, compared
-
-
-def _without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Replace each block by the median of it and its neighbours: one alone is no change."""
-    result = values.copy()
-    for row, weight in zip(result, weights, strict=True):
-        known = np.flatnonzero(weight > 0)
-        if known.size >= FEWEST:
-            inner = row[known]
-            three = np.stack([inner[:-2], inner[1:-1], inner[2:]])
-            middle = np.median(three, axis=0)
-            row[known] = np.concatenate([middle[:1], middle, middle[-1:]])
-    return result
-
-
-def _limited(weights: FloatArray) -> FloatArray:
-    """Limit weights: what a model leaves doesn't fall with what a block tells.
-
-    With the variance of the median block's noise in each block beside its own.
-    """
-    usual = np.array([np.median(row[row > 0]) if row.any() else 1.0 for row in weights])[:, None]
-    return weights * usual / (weights + usual)
-
-
-def _correlation(values: FloatArray, weights: FloatArray) -> float:
-    """Return the correlation from block to block of the median joint."""
-    found: list[float] = []
-    for value, weight in zip(values, weights, strict=True):
-        kept = value[weight > 0]
-        if kept.size >= FEWEST:
-            away = kept - np.median(kept)
-            away = np.clip(away, *(np.quantile(away, (0.05, 0.95))))
-            power = float(away @ away)
-            rho = float(away[1:] @ away[:-1]) / power if power > 0 else 0.0
-            found.append(rho + (1 + 4 * max(rho, 0.0)) / kept.size)
-    return min(max(float(np.median(found)), 0.0), 0.95) if found else 0.0
-
-
-def _largest(
-    values: FloatArray,
-    weights: FloatArray,
-    rho: float,
-    tests: int,
-    shortest: int,
-    *,
-    compared: bool,
-) -> _Run | None:
-    """Return the most certain run of blocks, or None if none is beyond the level.
-
-    Args:
-        compared: Whether like joints have taken off what a model leaves: then what is left is
-            chance, and the plain difference of means must be beyond it, too.
-    """
-    known = np.flatnonzero(weights > 0)
-    v, w = values[known], weights[known]
-    # So many blocks of one weight know as much.
-    if known.size < FEWEST or float(w.sum()) ** 2 < FEWEST * float(w @ w):
-        return None
-    best: tuple[float, _Run] | None = None
-    for lasting in (True, False):
-        first, last = _runs(known.size, shortest, lasting=lasting)
-        if not first.size:
-            continue
-        change, outside, error = _fitted(v, w, first, last, rho)
-        if compared:
-            error = np.maximum(error, _plain_error(v, w, first, last, rho))
-        limit = -float(stdtrit(known.size - 3, LEVEL / 4 / tests / first.size))
-        t = np.abs(change) / error
-        k = int(np.argmax(t))
-        if t[k] > limit and (best is None or t[k] / limit > best[0]):
-            start = 0 if first[k] == 0 else int(known[first[k]])
-            stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
-            inner = float(w[first[k] : last[k]].sum())
-            drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
-            means = _means(v, w, int(first[k]), int(last[k]))
-            size = float(change[k]) if means is None else means[0] - means[1]
-            run = _Run(size, float(outside[k]), float(error[k]), start, stop, drop)
-            best = t[k] / limit, run
-    return None if best is None else best[1]
-
-
-def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, float] | None:
-    """Return the means in and out of a run, without the blocks at its ends, which hold both.
-
-    None where too few blocks are left.
-    """
-    begins, ends = first > 0, last < v.size
-    inside = np.zeros(v.size, dtype=np.bool_)
-    inside[first + begins : last - ends] = True
-    outside = np.ones(v.size, dtype=np.bool_)
-    outside[max(first - begins, 0) : last + ends] = False
-    if not (inside.any() and outside.any()):
-        return None
-    within, beyond = (float(w[part] @ v[part] / w[part].sum()) for part in (inside, outside))
-    return within, beyond
-
-
-def _runs(count: int, shortest: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
-    """Return first block and the one after the last of runs to one end, or within."""
-    if lasting:
-        cuts = np.arange(shortest, count - shortest + 1)
-        half = cuts * 2 > count  # the shorter part is what changed
-        first = np.where(half, cuts, 0)
-        last = np.where(half, count, cuts)
-        return first, last
-    first, last = np.triu_indices(count, shortest)
-    inner = (first > 0) & (last < count) & ((last - first) * 2 <= count)
-    return first[inner], last[inner]
-
-
-def _fitted(
-    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return c and m of equation (1), and the standard error of c, of runs."""
-    scale = np.sqrt(w)
-    whole = _whitened(scale, rho)
-    target = _whitened(scale * v, rho)
-    # A whitened run is that of all blocks inside, and differs where it begins and after its end.
-    begin = scale * np.where(np.arange(v.size) == 0, (1 - rho**2) ** 0.5, 1.0)
-    sums = np.concatenate([np.zeros((2, 1)), np.cumsum([whole**2, whole * target], axis=1)], axis=1)
-    after = np.minimum(last, v.size - 1)
-    behind = np.where(last < v.size, -rho * scale[last - 1], 0.0)
-    own, of_target = sums[:, last] - sums[:, first + 1]
-    power = own + begin[first] ** 2 + behind**2
-    along = own + begin[first] * whole[first] + behind * whole[after]
-    moment = of_target + begin[first] * target[first] + behind * target[after]
-    level, total = sums[0, -1], sums[1, -1]
-    free = np.maximum(power - along**2 / level, 1e-300)
-    change = (moment - along * total / level) / free
-    left = float(target @ target) - total**2 / level - change**2 * free
-    variance = np.maximum(left, 1e-300) / max(v.size - 3, 1) / free
-    return change, (total - change * along) / level, np.sqrt(variance)
-
-
-def _plain_error(
-    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
-) -> FloatArray:
-    """Return the standard error of the difference of means in and out of runs."""
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
-    inside = sums[:, last] - sums[:, first]
-    (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
-    squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
-    freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
-    return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), 1e-300))
-
-
-def _whitened(values: FloatArray, rho: float) -> FloatArray:
-    """Take the autoregression off, the first value scaled as all before would have made it."""
-    result = values.copy()
-    result[1:] -= rho * values[:-1]
-    result[0] *= (1 - rho**2) ** 0.5
-    return result

@@ -108,7 +108,7 @@ def exposure_of(
 
 
 def _usual_gain(others: Sequence[Response]) -> float:
-    """Return the gain to ask of a joint without like joints: 1, or less where most others give less.
+    """Return the gain to ask of a joint without like joints: 1, or less where most give less.
 
     The joints of a body too heavy for its motors follow by less, and none of them is at fault.
     """

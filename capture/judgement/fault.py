@@ -63,9 +63,9 @@ class Change:
     """A joint whose response changed during the session: a difference, no fault.
 
     Attributes:
-        quantity: ``gain``, ``lag``, ``offset`` or ``noise``.
-        change: Relative to before for ``gain``; [s] for ``lag``, [rad] for ``offset``; the ratio
-            to before for ``noise``.
+        quantity: ``gain``, ``lag``, ``offset``, ``noise``, or ``drift`` of the offset.
+        change: Relative to before for ``gain``; [s] for ``lag``, [rad] for ``offset`` and from the
+            beginning to the end for ``drift``; the ratio to before for ``noise``.
         half_width: Of its simultaneous 95 % interval; of the logarithm for ``noise``.
         from_s: When it began, from the session's start [s].
         until_s: When it was as before again [s]; None for a lasting change.
@@ -83,6 +83,8 @@ class Change:
     @property
     def text(self) -> str:
         """What changed, e.g. ``from 16.5 s on gain 40 % less``."""
+        if self.quantity == "drift":
+            return f"its mean drifts by {math.degrees(self.change):+.2g} degrees"
         end = "on" if self.until_s is None else f"to {self.until_s:.1f} s"
         return f"from {self.from_s:.1f} s {end} {_size(self.quantity, self.change)}"
 

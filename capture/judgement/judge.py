@@ -19,7 +19,6 @@ from .bursts import find_bursts
 from .changes import SHORTEST_S, WIDTH, Jump, find_jumps
 from .exposure import (
     COHERENT,
-    ENOUGH_LIKE,
     RESPONDS,
     REST_ERRORS,
     Exposure,
@@ -92,6 +91,11 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     usable &= healthy[:, None]
     names = [motion.name for motion in driven]
     jumps = find_jumps(course, exposure, usable)
+    for jump in jumps:
+        if jump.quantity == "gain" and jump.change < RESPONDS - 1:
+            like = [driven[j] for j in exposure.group(jump.joint)]
+            faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)
+    jumps = [jump for jump in jumps if names[jump.joint] not in faults]
     changed = {jump.joint for jump in jumps}
     for k, share in find_bursts(course, exposure, usable).items():
         if k not in changed:
@@ -371,6 +375,18 @@ def _fault(
     end = float(motion.position.t_s[-1])
     until = None if end - spans[-1][1] < motion.position.period_s * BLOCKS else spans[-1][1]
     return Fault(motion.name, kinds, spans, spans[0][0], until, min(share, 1.0), text)
+
+
+def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Fault:
+    """Return the fault of a joint whose motion nearly ends at a time."""
+    end = float(motion.position.t_s[-1])
+    span = jump.first_s, min(jump.last_s, end)
+    kinds, why = standing_kinds(motion, [span], like)
+    text = f"moves {100 * -jump.change:.0f} % less than before"
+    until = jump.last_s if isfinite(jump.last_s) else None
+    share = (span[1] - span[0]) / max(end - float(motion.position.t_s[0]), 1e-9)
+    evidence = f"{text}; {why}" if why else text
+    return Fault(motion.name, kinds, (span,), span[0], until, min(share, 1.0), evidence)
 
 
 def _change(names: Sequence[str], jump: Jump) -> Change:

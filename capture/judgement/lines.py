@@ -18,9 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
-from .changes import ANGLE_MARGIN_RAD, LEVEL, WIDTH
+from .changes import ANGLE_MARGIN_RAD, WIDTH
 from .exposure import REST_ERRORS, Exposure
 from .motion import Course, cycle_s
+from .shifts import LEVEL
 
 TAPERS = 8
 """Sine tapers: 14 degrees of freedom of the noise, with lines resolved to 8 cycles a record."""
@@ -80,15 +81,13 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     return lines
 
 
-def _least_rad(
-    frequency: FloatArray, course: Course, exposure: Exposure, k: int
-) -> FloatArray:
+def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int) -> FloatArray:
     """Return the amplitude of a line that matters, at each frequency [rad].
 
     Unless like joints share it, three rest errors up to the last harmonic of the motion's own
     frequency: there play and stick move a joint.
     """
-    motion = exposure.fitted[k] - np.mean(exposure.fitted[k])
+    motion: FloatArray = exposure.fitted[k] - float(np.mean(exposure.fitted[k]))
     rate = np.gradient(motion, course.step_s)
     slow = float(np.linalg.norm(rate)) / max(2 * np.pi * float(np.linalg.norm(motion)), 1e-300)
     rest = REST_ERRORS * exposure.rest_rad[k] if len(exposure.group(k)) == 1 else 0.0

@@ -12,8 +12,8 @@ with the powers P and C of positions and commands about their means and their cr
 it counts as 0. One gain for all keeps what amplitudes tell. It is the median ratio of the sorted
 amplitudes, which no permutation changes and a few faulty joints hardly. For each delay the best
 permutation is a linear assignment (Crouse, IEEE Trans. Aerosp. Electron. Syst. 52, 2016, doi
-10.1109/TAES.2016.140952, in SciPy). Delays go up to half a period of the commands: a servo of two
-poles lags by 180 degrees at most.
+10.1109/TAES.2016.140952, in SciPy). Delays go up to half a period of the commands, as a servo of
+two poles lags by 180 degrees at most, or to the longest dead time of a bus.
 
 What one uniform gait can't tell. With c_j(t) = A sin(w t - j psi) the command of joint j + 1 is
 that of joint j, later by psi / w: names that are shifted by one joint, and a lag of psi for all,
@@ -36,13 +36,14 @@ from scipy.optimize import linear_sum_assignment
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..common.errors import DataError, some_names
+from .response import LATEST_S
 
 MOVES = 0.01
 """A joint whose standard deviation is below this share of the largest stands still: the share by
 which the analysis tells driven joints (``DRIVEN_SHARE``)."""
 
 DELAYS = 33
-"""Delays that are tried, from 0 to half a period: 5.6 degrees of phase apart, so that the nearest
+"""Delays that are tried in half a period: 5.6 degrees of phase apart, so that the nearest
 is within 2.8 degrees, which costs sin^2 = 0.24 % of the explained share."""
 
 PER_PERIOD = 16
@@ -320,7 +321,9 @@ def _explained_pairs(commands: FloatArray, positions: FloatArray, step_s: float)
         return None
     if not 2 * step_s < period_s <= count * step_s / LEAST_PERIODS:
         return None
-    delay_s = np.linspace(0.0, period_s / 2, DELAYS)
+    longest_s = max(period_s / 2, min(period_s, LATEST_S))
+    tried = int(np.ceil(DELAYS * longest_s / (period_s / 2)))
+    delay_s = np.linspace(0.0, longest_s, tried)
     skipped = int(np.ceil(delay_s[-1] / step_s))
     stride = max(1, int(period_s / (PER_PERIOD * step_s)))
     rows: IntArray = np.arange(skipped, count, stride, dtype=np.int64)
@@ -329,7 +332,7 @@ def _explained_pairs(commands: FloatArray, positions: FloatArray, step_s: float)
     given_values = positions[rows] - positions[rows].mean(axis=0)
     power = np.sum(given_values**2, axis=0)
     gain = _common_gain(commands[:, asked], positions[:, given])
-    explained = np.empty((DELAYS, joints, joints))
+    explained = np.empty((delay_s.size, joints, joints))
     opposite = np.empty_like(explained)
     for k, delay in enumerate(delay_s):
         late = curve(time_s[rows] - delay)

@@ -240,5 +240,29 @@ def test_what_all_joints_do_together_is_no_joint_s_fault(chain):
     assert not found or len(found) == 9
 
 
+def test_a_pause_of_the_bus_in_which_a_driver_repeats_accuses_nobody(chain):
+    for first in (300, 700, 1100):
+        chain.position[:, first : first + 80] = chain.position[:, [first - 1]]
+    judgement = judge(chain.motions())
+    assert (judgement.faults, judgement.changes) == ((), ())
+
+
+def test_joints_that_are_late_by_half_a_cycle_are_not_said_to_be_inverted():
+    chain = Chain()
+    fast = 2 * np.pi * 1.9
+    phase = fast * chain.t - np.arange(9)[:, None] / 2
+    chain.command, chain.position = 0.3 * np.sin(phase), 0.27 * np.sin(phase - 0.28 * fast)
+    judgement = judge(chain.motions())
+    assert judgement.faults == ()
+    assert judgement.naming.startswith("all joints move against their commands, or lag by 0.28 s")
+
+
+def test_a_zero_that_drifts_is_a_drift(chain):
+    chain.position[BROKEN] += np.linspace(0, np.radians(4), chain.t.size)
+    (change,) = judge(chain.motions()).changes
+    assert (change.joint, change.quantity) == ("j4", "drift")
+    assert change.change == pytest.approx(np.radians(4), rel=0.15)
+
+
 def test_every_kind_says_where_it_lies():
     assert {about for about, _ in KINDS.values()} == {"mechanics", "wiring", "sensor", "record"}

@@ -1,0 +1,237 @@
+"""Level shifts and drifts in a series of estimates: one run of values, or a line, beside a level.
+
+The estimates v_i of b blocks, of weights w_i, are
+
+    v_i = m + c x_i + s n_i / sqrt(w_i),                                                     (1)
+
+with x_i = 1 in one run of blocks and 0 elsewhere, or rising evenly from 0 to 1, and n an
+autoregression of the correlation rho from block to block, of which the median over the joints is
+taken, its bias of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi
+10.1093/biomet/41.3-4.390). Generalised least squares gives c and its error (Prais & Winsten, Cowles
+Commission 383, 1954); c over its error has Student's distribution. Level: half for the lasting
+changes, of which there are about b a series, half for the passing ones, b^2/2 (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from ..common.arrays import FloatArray, IntArray
+
+LEVEL = 0.01
+"""Chance of any change in a session of healthy joints."""
+
+FEWEST = 8
+"""Blocks that a comparison needs (with fewer, 1 % of all changes has no threshold)."""
+
+
+ROBUST = 1.4826
+"""Standard deviation of normal values in their median distance from the middle."""
+
+TAME = 4
+"""Robust standard deviations of a block beyond which a sample has no more weight: of normal noise
+6 in 100,000 are, and single samples of heavy tails decide nothing (Huber)."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A run of blocks and how it differs from the others; or a drift, whose run is all of them.
+
+    Attributes:
+        change: c of equation (1), between blocks that hold no change themselves.
+        outside: m.
+        error: Standard error of c.
+        first: First block of the run.
+        last: The one behind its last.
+        drop: Of the weighted sum of squares.
+    """
+
+    change: float
+    outside: float  # mean of the others
+    error: float
+    first: int
+    last: int
+    drop: float  # of the sum of squares
+
+
+def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Replace a block that is far from both its neighbours by their median: alone it is no change.
+
+    Far is beyond :data:`TAME` robust standard deviations of what blocks differ from that median.
+    """
+    result = values.copy()
+    for row, weight in zip(result, weights, strict=True):
+        known = np.flatnonzero(weight > 0)
+        if known.size >= FEWEST:
+            inner = row[known]
+            middle = np.median([inner[:-2], inner[1:-1], inner[2:]], axis=0)
+            middle = np.concatenate([middle[:1], middle, middle[-1:]])
+            away = np.abs(inner - middle)
+            far = away > TAME * ROBUST * np.median(away[away > 0]) if away.any() else away > 0
+            row[known] = np.where(far, middle, inner)
+    return result
+
+
+def limited_weights(weights: FloatArray) -> FloatArray:
+    """Limit weights: what a model leaves doesn't fall with what a block tells.
+
+    With the variance of the median block's noise in each block beside its own.
+    """
+    usual = np.array([np.median(row[row > 0]) if row.any() else 1.0 for row in weights])[:, None]
+    return weights * usual / (weights + usual)
+
+
+def correlation_of(values: FloatArray, weights: FloatArray) -> float:
+    """Return the correlation from block to block of the median joint."""
+    found: list[float] = []
+    for value, weight in zip(values, weights, strict=True):
+        kept = value[weight > 0]
+        if kept.size >= FEWEST:
+            away = kept - np.median(kept)
+            away = np.clip(away, *(np.quantile(away, (0.05, 0.95))))
+            power = float(away @ away)
+            rho = float(away[1:] @ away[:-1]) / power if power > 0 else 0.0
+            found.append(rho + (1 + 4 * max(rho, 0.0)) / kept.size)
+    return min(max(float(np.median(found)), 0.0), 0.95) if found else 0.0
+
+
+def largest_shift(
+    values: FloatArray,
+    weights: FloatArray,
+    rho: float,
+    tests: int,
+    shortest: int,
+    *,
+    compared: bool,
+) -> Shift | None:
+    """Return the most certain run of blocks, or None if none is beyond the level.
+
+    Args:
+        compared: Whether like joints have taken off what a model leaves: then what is left is
+            chance, and the plain difference of means must be beyond it, too.
+    """
+    known = np.flatnonzero(weights > 0)
+    v, w = values[known], weights[known]
+    # So many blocks of one weight know as much.
+    if known.size < FEWEST or float(w.sum()) ** 2 < FEWEST * float(w @ w):
+        return None
+    best: tuple[float, Shift] | None = None
+    for lasting in (True, False):
+        first, last = _runs(known.size, shortest, lasting=lasting)
+        if not first.size:
+            continue
+        change, outside, error = _fitted(v, w, first, last, rho)
+        if compared:
+            error = np.maximum(error, _plain_error(v, w, first, last, rho))
+        limit = -float(stdtrit(known.size - 3, LEVEL / 4 / tests / first.size))
+        t = np.abs(change) / error
+        k = int(np.argmax(t))
+        if t[k] > limit and (best is None or t[k] / limit > best[0]):
+            start = 0 if first[k] == 0 else int(known[first[k]])
+            stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
+            inner = float(w[first[k] : last[k]].sum())
+            drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
+            means = _means(v, w, int(first[k]), int(last[k]))
+            size = float(change[k]) if means is None else means[0] - means[1]
+            run = Shift(size, float(outside[k]), float(error[k]), start, stop, drop)
+            best = t[k] / limit, run
+    return None if best is None else best[1]
+
+
+def drift_of(values: FloatArray, weights: FloatArray, rho: float, tests: int) -> Shift | None:
+    """Return the even drift of a series, or None if it isn't beyond the level.
+
+    Args:
+        rho: Correlation from block to block.
+        tests: Number of series that are looked at.
+    """
+    known = np.flatnonzero(weights > 0)
+    if known.size < FEWEST:
+        return None
+    v, w = values[known], weights[known]
+    along = known / max(values.size - 1, 1)
+    x = along - float(w @ along) / float(w.sum())
+    power = float(w @ x**2)
+    change = float(w @ (x * v)) / power
+    left = v - float(w @ v) / float(w.sum()) - change * x
+    freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
+    error = max(float(w @ left**2) / freedom / power, 1e-300) ** 0.5
+    if abs(change) < -float(stdtrit(max(freedom, 1.0), LEVEL / 2 / tests)) * error:
+        return None
+    return Shift(change, float(w @ v) / float(w.sum()), error, 0, values.size, change**2 * power)
+
+
+def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, float] | None:
+    """Return the means in and out of a run, without the blocks at its ends, which hold both.
+
+    None where too few blocks are left.
+    """
+    begins, ends = first > 0, last < v.size
+    inside = np.zeros(v.size, dtype=np.bool_)
+    inside[first + begins : last - ends] = True
+    outside = np.ones(v.size, dtype=np.bool_)
+    outside[max(first - begins, 0) : last + ends] = False
+    if not (inside.any() and outside.any()):
+        return None
+    within, beyond = (float(w[part] @ v[part] / w[part].sum()) for part in (inside, outside))
+    return within, beyond
+
+
+def _runs(count: int, shortest: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
+    """Return first block and the one after the last of runs to one end, or within."""
+    if lasting:
+        cuts = np.arange(shortest, count - shortest + 1)
+        half = cuts * 2 > count  # the shorter part is what changed
+        first = np.where(half, cuts, 0)
+        last = np.where(half, count, cuts)
+        return first, last
+    first, last = np.triu_indices(count, shortest)
+    inner = (first > 0) & (last < count) & ((last - first) * 2 <= count)
+    return first[inner], last[inner]
+
+
+def _fitted(
+    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return c and m of equation (1), and the standard error of c, of runs."""
+    scale = np.sqrt(w)
+    whole = _whitened(scale, rho)
+    target = _whitened(scale * v, rho)
+    # A whitened run is that of all blocks inside, and differs where it begins and after its end.
+    begin = scale * np.where(np.arange(v.size) == 0, (1 - rho**2) ** 0.5, 1.0)
+    sums = np.concatenate([np.zeros((2, 1)), np.cumsum([whole**2, whole * target], axis=1)], axis=1)
+    after = np.minimum(last, v.size - 1)
+    behind = np.where(last < v.size, -rho * scale[last - 1], 0.0)
+    own, of_target = sums[:, last] - sums[:, first + 1]
+    power = own + begin[first] ** 2 + behind**2
+    along = own + begin[first] * whole[first] + behind * whole[after]
+    moment = of_target + begin[first] * target[first] + behind * target[after]
+    level, total = sums[0, -1], sums[1, -1]
+    free = np.maximum(power - along**2 / level, 1e-300)
+    change = (moment - along * total / level) / free
+    left = float(target @ target) - total**2 / level - change**2 * free
+    variance = np.maximum(left, 1e-300) / max(v.size - 3, 1) / free
+    return change, (total - change * along) / level, np.sqrt(variance)
+
+
+def _plain_error(
+    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
+) -> FloatArray:
+    """Return the standard error of the difference of means in and out of runs."""
+    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
+    inside = sums[:, last] - sums[:, first]
+    (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
+    squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
+    freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
+    return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), 1e-300))
+
+
+def _whitened(values: FloatArray, rho: float) -> FloatArray:
+    """Take the autoregression off, the first value scaled as all before would have made it."""
+    result = values.copy()
+    result[1:] -= rho * values[:-1]
+    result[0] *= (1 - rho**2) ** 0.5
+    return result
