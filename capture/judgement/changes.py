@@ -167,8 +167,8 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
     if quantity == "gain":
         return _reaches(run, GAIN_MARGIN) and abs(run.change) > lost / amplitude
     speed = max((2 * float(rate[inside].sum()) / samples) ** 0.5, 1e-9)
-    # One degree of a cycle, as an angle of the wave of that amplitude and rate.
-    margin = float(ANGLE_MARGIN_RAD) * amplitude / speed
+    # One degree of a cycle; without one, as an angle of the wave of that amplitude and rate.
+    margin = float(ANGLE_MARGIN_RAD) * (blocks.half_s / np.pi or amplitude / speed)
     return _reaches(run, margin) and abs(run.change) > lost / speed
 
 

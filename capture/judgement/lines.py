@@ -87,7 +87,8 @@ def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int
     Unless like joints share it, three rest errors up to the last harmonic of the motion's own
     frequency: there play and stick move a joint.
     """
-    motion: FloatArray = exposure.fitted[k] - float(np.mean(exposure.fitted[k]))
+    motion: FloatArray = exposure.fitted[k]
+    motion = motion - motion.mean()
     rate = np.gradient(motion, course.step_s)
     slow = float(np.linalg.norm(rate)) / max(2 * np.pi * float(np.linalg.norm(motion)), 1e-300)
     rest = REST_ERRORS * exposure.rest_rad[k] if len(exposure.group(k)) == 1 else 0.0

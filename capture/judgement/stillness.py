@@ -74,7 +74,7 @@ def _follows(exposure: Exposure, k: int) -> bool:
 def _gain(exposure: Exposure, k: int) -> float:
     """Return the gain of healthy joints like one."""
     asked, fitted = np.ptp(exposure.healthy[k]), np.ptp(exposure.fitted[k])
-    gain = exposure.responses[k].gain
+    gain = abs(exposure.responses[k].gain)
     return float(gain * asked / fitted) if fitted > 0 else 1.0
 
 

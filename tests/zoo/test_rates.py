@@ -43,7 +43,8 @@ def test_a_session_in_memory_states_what_its_file_states(tmp_path, opened, case)
     answer = analyse_session(opened(path)).answer
     assert statement.sentence == answer.sentence
     assert [a.joint for a in statement.accused] == [f.joint for f in answer.not_following]
-    assert [d.joint for d in statement.different] == [d.joint for d in answer.stand_out]
+    differences = (*answer.stand_out, *answer.changes, *answer.extra, *answer.rests)
+    assert [d.joint for d in statement.different] == [d.joint for d in differences]
     assert statement.alike == bool(answer.alike)
     assert not statement.shaped
     if case == "jammed":
