@@ -160,7 +160,7 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
         return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
     inside = slice(run.first, run.last)
     _, motion, rate, count = blocks.weights[:, k]
-    if blocks.swept[k] and not compared:  # another time is another frequency
+    if blocks.swept[k]:  # another time is another frequency
         return False
     samples = max(float(count[inside].sum()), 1.0)
     amplitude = max((2 * float(motion[inside].sum()) / samples) ** 0.5, 1e-9)

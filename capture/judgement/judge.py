@@ -92,7 +92,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     names = [motion.name for motion in driven]
     jumps = find_jumps(course, exposure, usable)
     for jump in jumps:
-        if jump.quantity == "gain" and jump.change < RESPONDS - 1:
+        if jump.quantity == "gain" and _ends(course, exposure, jump):
             like = [driven[j] for j in exposure.group(jump.joint)]
             faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)
     jumps = [jump for jump in jumps if names[jump.joint] not in faults]
@@ -375,6 +375,21 @@ def _fault(
     end = float(motion.position.t_s[-1])
     until = None if end - spans[-1][1] < motion.position.period_s * BLOCKS else spans[-1][1]
     return Fault(motion.name, kinds, spans, spans[0][0], until, min(share, 1.0), text)
+
+
+def _ends(course: Course, exposure: Exposure, jump: Jump) -> bool:
+    """Return whether a joint's motion nearly ends at a change, where a healthy one goes on.
+
+    Its motion is what goes with the healthy one or with its rate; the rest is noise.
+    """
+    k, inside = jump.joint, (course.t_s > jump.first_s + jump.block_s) & (course.t_s < jump.last_s)
+    if jump.change > RESPONDS - 1 or not inside.any():
+        return False
+    healthy = exposure.healthy[k]
+    asked = np.stack([healthy, np.gradient(healthy, course.step_s)])[:, inside]
+    design: FloatArray = (asked - asked.mean(axis=1, keepdims=True)).T
+    factors = np.asarray(np.linalg.lstsq(design, course.position[k, inside])[0], dtype=np.float64)
+    return bool(np.std(design @ factors) < RESPONDS * np.std(healthy[inside]))
 
 
 def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Fault:

@@ -213,5 +213,6 @@ def is_sweep(command: FloatArray) -> bool:
     lengths = np.diff(rises_of(command))
     if lengths.size < 3 or lengths.min() == lengths.max():
         return False
-    ranks = np.unique(lengths, return_inverse=True)[1]
+    _, which, counts = np.unique(lengths, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - counts / 2)[which]  # equal lengths share the middle of their ranks
     return bool(abs(np.corrcoef(ranks, np.arange(lengths.size))[0, 1]) > SWEPT)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from support.joint_runs import write_joints
-from support.paths import SHARED
+from support.paths import DOCS, SHARED
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture.common.errors import DataError
-from zoo import adapter, rates, real_faults
+from zoo import adapter, rates, real_faults, recorded_page
 from zoo.adapter import Accused, Said, Signals, stated
 from zoo.independent_fit import independent_fit
 from zoo.planted_faults import draw, record
@@ -256,6 +256,20 @@ def test_what_is_stated_without_the_fault_is_no_answer_to_it(monkeypatch):
 
 
 needs_recordings = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recordings in {SHARED}")
+
+
+@needs_recordings
+@pytest.mark.slow
+def test_the_manual_says_what_is_stated_of_recordings():
+    page = (DOCS / "explanation/faults.md").read_text()
+    assert "\n".join(recorded_page.lines()) in page, "renew it: python -m zoo.recorded_page"
+
+
+@needs_recordings
+@pytest.mark.slow
+@pytest.mark.parametrize("name", recordings())
+def test_no_joint_of_a_sound_robot_is_accused(name):
+    assert stated(recordings()[name]()).accused == ()
 
 
 @needs_recordings
