@@ -87,15 +87,15 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
         if name not in faults or fault.kinds != ("lost_samples",):
             faults[name] = fault
     usable = usable_steps(course, exposure, stillness)
-    healthy = np.array([motion.name not in faults for motion in driven])
-    usable &= healthy[:, None]
     names = [motion.name for motion in driven]
+    usable[[name in faults for name in names]] = False
     jumps = find_jumps(course, exposure, usable)
-    for jump in jumps:
-        if jump.quantity == "gain" and _ends(course, exposure, jump):
-            like = [driven[j] for j in exposure.group(jump.joint)]
-            faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)
-    jumps = [jump for jump in jumps if names[jump.joint] not in faults]
+    for jump in [jump for jump in jumps if _ends(course, exposure, jump)]:
+        like = [driven[j] for j in exposure.group(jump.joint)]
+        faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)
+        jumps.remove(jump)
+    healthy = [name not in faults for name in names]
+    usable[np.logical_not(healthy)] = False
     changed = {jump.joint for jump in jumps}
     for k, share in find_bursts(course, exposure, usable).items():
         if k not in changed:
@@ -383,7 +383,7 @@ def _ends(course: Course, exposure: Exposure, jump: Jump) -> bool:
     Its motion is what goes with the healthy one or with its rate; the rest is noise.
     """
     k, inside = jump.joint, (course.t_s > jump.first_s + jump.block_s) & (course.t_s < jump.last_s)
-    if jump.change > RESPONDS - 1 or not inside.any():
+    if jump.quantity != "gain" or jump.change > RESPONDS - 1 or not inside.any():
         return False
     healthy = exposure.healthy[k]
     asked = np.stack([healthy, np.gradient(healthy, course.step_s)])[:, inside]

@@ -27,7 +27,6 @@ LEVEL = 0.01
 FEWEST = 8
 """Blocks that a comparison needs (with fewer, 1 % of all changes has no threshold)."""
 
-
 ROBUST = 1.4826
 """Standard deviation of normal values in their median distance from the middle."""
 
@@ -50,11 +49,11 @@ class Shift:
     """
 
     change: float
-    outside: float  # mean of the others
+    outside: float
     error: float
     first: int
     last: int
-    drop: float  # of the sum of squares
+    drop: float
 
 
 def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
