@@ -17,7 +17,7 @@ from undulog.capture.judgement.fault import NOTHING, Judgement, clause_of
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
-from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
+from ..results.answer import Answer, Artefact, NotFollowing, Shape, StandOut, Verdict
 from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import BodyWave, FreeMotion, JointFrequencyResponse
 from .examine import Findings
@@ -51,6 +51,7 @@ class Facts:
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
         judgement: How the joints follow their commands.
+        artefacts: Of the joints' signals.
         warnings: Of the analysis: they hold the reason where there is no answer.
         frequency_response: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
@@ -67,6 +68,7 @@ class Facts:
     left_out: str = ""
     motion: FreeMotion | None = None
     judgement: Judgement = NOTHING
+    artefacts: tuple[Artefact, ...] = ()
 
 
 def compose(facts: Facts) -> Answer:
@@ -85,7 +87,9 @@ def compose(facts: Facts) -> Answer:
         alike = True
     return Answer(
         verdict=verdict,
-        sentence=" ".join(part for part in (first, rest, _left_out(facts), broken) if part),
+        sentence=" ".join(
+            part for part in (first, rest, _left_out(facts), _scales(facts), broken) if part
+        ),
         detail=detail,
         not_following=facts.not_following,
         changes=facts.judgement.changes,
@@ -194,6 +198,17 @@ def _left_out(facts: Facts) -> str:
     listed = ", ".join(names[:NAMED])
     listed += f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return f"Not compared: {listed}."
+
+
+def _scales(facts: Facts) -> str:
+    """Say which joints' velocities have another scale than their positions; empty for none."""
+    clauses = [
+        f"{plain(each.joint)}'s velocity is {each.note}"
+        for each in facts.artefacts
+        if (each.quantity, each.flag) == ("velocity", "scale_mismatch") and each.note
+    ]
+    more = f" and {len(clauses) - NAMED} more" if len(clauses) > NAMED else ""
+    return f"{'; '.join(clauses[:NAMED])}{more}." if clauses else ""
 
 
 def _undecided(facts: Facts) -> str:

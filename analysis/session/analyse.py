@@ -250,6 +250,7 @@ def measure_session(
         left_out=left_out,
         motion=analysis.free_motion,
         judgement=follows.judgement,
+        artefacts=artefacts,
     )
     analysis = dataclasses.replace(analysis, answer=led(compose(facts), warn.leading))
     return SessionMeasurement(
