@@ -224,7 +224,9 @@ def _ends(facts: Facts, plane: str, group: int) -> tuple[str, ...]:
     names = [
         joint.name
         for joint in facts.joints
-        if joint.name in compared and (joint.plane or "chain", joint.group) == (plane, group)
+        if joint.name in compared
+        and plane in ("chain", joint.plane)
+        and joint.group in (None, group)
     ]
     return (names[0], names[-1]) if len(names) > 1 else ()
 

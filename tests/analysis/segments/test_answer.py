@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from undulog.analysis.results.answer import NotFollowing, Shape, StandOut, Verdict
+from undulog.analysis.results.answer import Artefact, NotFollowing, Shape, StandOut, Verdict
 from undulog.analysis.segments.answer import Facts, compose, kinds_in_words
 from undulog.analysis.segments.examine import Findings
 
@@ -117,3 +117,26 @@ def test_a_sentence_ends_with_one_stop(name, request):
     for text in (found.sentence, found.detail):
         assert text.endswith(".")
         assert not text.endswith("..")
+
+
+def test_ends_that_their_neighbours_do_not_follow_are_left_open(snake):
+    shape = Shape("ends", "gain", "horizontal", 0, -0.03, (-0.04, -0.02))
+    found = compose(facts(snake, shape=(shape,), boundary=((YAW[0], YAW[-1]),)))
+    both = "the boundary or joint01 and joint25: reverse, swap modules, or compare with an earlier"
+    assert f"({both} session)." in found.sentence
+    assert found.undecided.startswith(both)
+    assert not found.stand_out
+
+
+def test_an_end_joint_alone_may_be_the_boundary_s_doing(snake):
+    end = dataclasses.replace(WEAK, joint=YAW[0])
+    found = compose(facts(snake, stand_out=(end,)))
+    assert "gain 20.0 % [18.0, 22.0] less: the joint or the boundary." in found.sentence
+    assert "the joint or the boundary" not in compose(facts(snake, stand_out=(WEAK,))).sentence
+
+
+def test_a_velocity_of_another_scale_is_said(snake):
+    note = "2.33 times the derivative of the position"
+    odd = Artefact("joint05", "/joint_states", "velocity", "scale_mismatch", (), note)
+    found = compose(dataclasses.replace(facts(snake), artefacts=(odd,)))
+    assert found.sentence.endswith(f"joint05's velocity is {note}.")

@@ -133,6 +133,19 @@ def test_below_the_margin_nobody_is_named():
     assert standing_out(one, critical_value([family_of(one)], draws=300)) == []
 
 
+def test_a_joint_at_the_margin_is_named():
+    """Its interval holds the margin, so that it can't be called alike."""
+    named = 0
+    for seed in range(20):
+        rng = np.random.default_rng(100 + seed)
+        values = np.full(9, 0.5)
+        values[3] += 0.02
+        one = profile(rng, values, margin=0.02)
+        found = standing_out(one, critical_value([family_of(one)], draws=300))
+        named += [each.joint for each in found] == [3]
+    assert named >= 18
+
+
 @pytest.mark.parametrize(
     ("shape", "kind"),
     [
