@@ -131,7 +131,8 @@ def _too_seldom(course: Course) -> bool:
     """
     command = course.command - np.median(course.command, axis=1, keepdims=True)
     now, middle = command[:, 1:-1], (command[:, 2:] + command[:, :-2]) / 2
-    cosine = np.sum(now * middle, axis=1) / np.sum(now**2, axis=1)
+    power = np.maximum(np.sum(now**2, axis=1), np.finfo(np.float64).tiny)
+    cosine = np.sum(now * middle, axis=1) / power
     left, size = np.median(np.abs([middle - cosine[:, None] * now, now]), axis=2)
     seldom = (left < COHERENT * size) & (cosine < np.cos(2 * np.pi / RESOLVED))
     return bool(2 * np.count_nonzero(seldom) > seldom.size)

@@ -153,7 +153,8 @@ def _present(motion: JointMotion, t_s: FloatArray, step_s: float) -> BoolArray:
 def _paused(command: FloatArray, position: FloatArray) -> BoolArray:
     """Mark the steps in which all joints repeat their values though most commands move.
 
-    Nothing came in over the bus meanwhile, and a driver repeated what it had; shape (n,).
+    Nothing came in over the bus meanwhile, and a driver repeated what it had; shape (n,). Joints
+    that stand for a third of the record or more are not one of these.
     """
     paused = np.zeros(position.shape[1], dtype=np.bool_)
     if position.shape[0] < 2:
@@ -163,7 +164,7 @@ def _paused(command: FloatArray, position: FloatArray) -> BoolArray:
         asked = np.ptp(command[:, first - 1 : last], axis=1)
         if np.median(asked) > LEAST_ASKED_RAD:
             paused[first:last] = True
-    return paused
+    return paused if 3 * np.count_nonzero(paused) < paused.size else np.zeros_like(paused)
 
 
 def runs_of(marked: BoolArray) -> list[tuple[int, int]]:

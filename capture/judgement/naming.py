@@ -350,7 +350,7 @@ def _explained_pairs(commands: FloatArray, positions: FloatArray, step_s: float)
 def _share(left: FloatArray, power: FloatArray) -> FloatArray:
     """Explained share of each row, at least 0."""
     whole = np.maximum(power, np.finfo(float).tiny)[:, None]
-    return np.maximum(1 - left / whole, 0.0)
+    return 1 - np.minimum(left, whole) / whole
 
 
 def _moving(values: FloatArray) -> BoolArray:

@@ -247,6 +247,11 @@ def test_a_pause_of_the_bus_in_which_a_driver_repeats_accuses_nobody(chain):
     assert (judgement.faults, judgement.changes) == ((), ())
 
 
+def test_joints_that_all_repeat_one_value_throughout_do_not_follow(chain):
+    chain.position[:] = 0.1
+    assert len(chain.judged()) == 9
+
+
 def test_joints_that_are_late_by_half_a_cycle_are_not_said_to_be_inverted():
     chain = Chain()
     fast = 2 * np.pi * 1.9
