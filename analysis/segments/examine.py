@@ -164,6 +164,8 @@ def examine(chains: Iterable[Chain]) -> Findings:
 
 def _spikes(values: FloatArray) -> bool:
     """Return whether the joints beside the ends don't follow the ends away from the middle."""
+    if values.size < MIN_JOINTS + 1:  # no middle beside the ends and their neighbours
+        return False
     away = values - np.median(values[2:-2])
     beside = max(abs(float(away[1])), abs(float(away[-2])))
     return beside < LOCAL * abs(float(away[0] + away[-1])) / 2

@@ -2,9 +2,9 @@
 
 A joint has to move in a time window if a healthy one like it would move there by more than three
 times the rest error, after its delay and settling. Neither comes from the judged joint alone: the
-healthy response is the median over the joints like it, or the command itself without such, and the
-rest error (dead band, sag, encoder step, noise) is the median of what the responses of the like
-joints leave; without like joints the most that the others leave.
+healthy response is the median over the joints like it, or without such the command, by less where
+most others give less, and the rest error (dead band, sag, encoder step, noise) is the median of
+what the responses of the like joints leave, or without such of all others.
 """
 
 from __future__ import annotations
