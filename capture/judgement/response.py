@@ -45,6 +45,9 @@ and Newton: from a grid of 50 ms they come within the 10 ms in which these conve
 POLISHES = 8
 """Steps of Gauss and Newton at most; each doubles the digits once it is near."""
 
+FIRST_POLISHES = 2
+"""Of them those after which the orders are compared, and one of them goes on."""
+
 DIFFERENCE_S = 1e-3
 """Difference by which slopes are taken [s]: small against all lags of servos."""
 
@@ -177,15 +180,15 @@ def fit_response(
                 best[k] = better
             else:
                 steps[k] /= 2
-    best = [_polished(fit, trimmed, filtered, bounds) for fit in best]
-    return min(best, key=_merit)[1]
+    best = [_polished(fit, trimmed, filtered, bounds, FIRST_POLISHES) for fit in best]
+    return _polished(min(best, key=_merit), trimmed, filtered, bounds, POLISHES)[1]
 
 
 def _polished(
-    fit: _Fit, trimmed: _Trimmed, filtered: Filtered, bounds: tuple[float, float]
+    fit: _Fit, trimmed: _Trimmed, filtered: Filtered, bounds: tuple[float, float], most: int
 ) -> _Fit:
     """Take steps of Gauss and Newton in gain, offset, delay and time constant."""
-    for _ in range(POLISHES):
+    for _ in range(most):
         _, centre, keep = fit
         aside = [replace(centre, delay_s=centre.delay_s + DIFFERENCE_S)]
         if centre.order:

@@ -23,6 +23,7 @@ def test_the_short_campaign_finds_nothing(tmp_path):
     assert done.returncode == 0, "\n".join(bad)[-6000:] + done.stderr[-2000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)
 def test_a_case_that_failed_once(path, tmp_path):
     folder = tmp_path / "w"

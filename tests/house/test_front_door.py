@@ -44,6 +44,7 @@ LAYOUT = {
 """Packages that parse a command line and lay out help."""
 
 
+@pytest.mark.slow
 def test_no_help_imports_a_package_besides_those_that_lay_it_out():
     # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
     groups = {verb.split()[0] for verb in undulog.VERBS}

@@ -130,6 +130,7 @@ def of_one(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", OF_ONE)
 def test_a_folder_of_one_session_is_that_session(line, of_one, tmp_path, capsys):
     words = {"folder": of_one, "out": tmp_path / "out", "run": of_one / "run.mcap"}

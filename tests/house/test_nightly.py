@@ -37,6 +37,7 @@ def night(tmp_path):
     return of
 
 
+@pytest.mark.slow
 def test_each_part_has_an_outcome_and_what_passed_is_not_run_again(night, tmp_path):
     code, states = night()
     expected = {"good": "passed", "bad": "failed", "long": "limit", "longer": "goes on"}

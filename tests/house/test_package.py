@@ -103,6 +103,7 @@ def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(wheel, tm
     assert file.startswith(str(place))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FOLDERS)
 @pytest.mark.parametrize("how", [("-c",), ("-m", "pytest", "-q", "-p", "no:cacheprovider")])
 def test_a_package_by_another_name_is_an_error(name, how, tmp_path):

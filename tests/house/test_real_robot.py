@@ -7,6 +7,7 @@ import pytest
 from support.paths import TRACE
 
 
+@pytest.mark.slow
 def test_a_ramp_is_imported_exported_and_has_no_gait(tmp_path, command):
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")

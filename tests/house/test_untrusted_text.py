@@ -143,14 +143,22 @@ def raw(text):
     return {c for c in text if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")} - {"\n"}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+def marked(commands):
+    """Return commands as parameters; what analyses more than once, or draws, is slow."""
+    slow = ("analyse A B", "analyse A --", "compare", "report", "view")
+    return [pytest.param(x, marks=pytest.mark.slow if x.startswith(slow) else ()) for x in commands]
+
+
+@pytest.mark.parametrize("command", marked(COMMANDS))
 def test_no_command_prints_a_control_character_or_a_forged_line(run, command):
     for text in run(command, *(() if "N" in command else forced(command))):
         assert raw(text) == set()
         assert not re.search(rf"(?m)^(# )?{FORGED[:6]}", text)
 
 
-@pytest.mark.parametrize("command", [x for x in COMMANDS if "N" not in x and "frames" not in x])
+@pytest.mark.parametrize(
+    "command", marked(x for x in COMMANDS if "N" not in x and "frames" not in x)
+)
 def test_json_is_one_value_and_keeps_the_names(run, command):
     out, _ = run(command, "--json", *forced(command))
     assert raw(out) == set()
@@ -217,6 +225,7 @@ class _Tags(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", ["report A -o p.html", "report A B -o q.html", "compare A B -o r.html"]
 )

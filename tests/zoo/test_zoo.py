@@ -15,6 +15,7 @@ SEED = 20250131
 """Of the fast test; printed with what fails."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per_servo", [False, True])
 def test_bags_are_read_back_by_another_reader(tmp_path, per_servo):
     channels = Channels("true", effort=True, second=True)
@@ -85,6 +86,7 @@ def verdict(cases):
     return "\n".join(failures(cases))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("first", range(4))
 def test_joints_that_do_not_follow_are_detected(first):
     """A seed a fault, on arrays; every fourth fault at a time."""

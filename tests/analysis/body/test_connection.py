@@ -16,6 +16,8 @@ from undulog.analysis.experiment.body_connection import (
 )
 from undulog.capture.common.errors import DataError
 
+pytestmark = pytest.mark.slow
+
 PHASES = 2 * np.pi * np.arange(24) / 24
 SWIMMER = Swimmer()
 

@@ -99,6 +99,7 @@ def test_facts_of_cut_and_lying_files(tmp_path):
         facts_of(path)
 
 
+@pytest.mark.slow
 def test_a_row_a_session_with_the_results_beside_it(lab, analysed):
     _, result = analysed
     catalog = Catalog(str(lab))
@@ -128,6 +129,7 @@ def test_a_row_a_session_with_the_results_beside_it(lab, analysed):
     assert catalog.sql("select count(*) as n from joints").n[0] == len(result.joints)
 
 
+@pytest.mark.slow
 def test_only_new_and_changed_files_are_read(lab, monkeypatch):
     Catalog(str(lab)).scan()
     opened = []
@@ -177,6 +179,7 @@ def test_a_session_that_can_t_be_analysed_has_its_reason(tmp_path):
     assert "/joint_commands" in catalog.analyse()["text.mcap"]
 
 
+@pytest.mark.slow
 def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
     whole = (lab / "day1" / "gait.mcap").read_bytes()
     (lab / "copy.mcap").write_bytes(whole[: len(whole) // 2])
@@ -268,6 +271,7 @@ def test_the_serial_number_is_that_of_the_description_or_of_the_metadata(tmp_pat
     assert len(catalog.find("serial = '0007'")) == 1
 
 
+@pytest.mark.slow
 def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(lab):
     catalog = Catalog(str(lab))
     catalog.scan()
@@ -312,6 +316,7 @@ def test_many_writers_at_once_lose_no_row(writers, results, lab):
     assert len(catalog.sql("select * from analyses")) == writers * results + 1
 
 
+@pytest.mark.slow
 def test_rows_that_were_put_together_but_not_removed_count_once(lab, monkeypatch):
     monkeypatch.setattr("undulog.analysis.catalog.files._MOST_FILES", 2)
     catalog = Catalog(str(lab))
@@ -326,6 +331,7 @@ def test_rows_that_were_put_together_but_not_removed_count_once(lab, monkeypatch
     assert Catalog(str(lab)).scan().read == 0
 
 
+@pytest.mark.slow
 def test_wrong_places_and_conditions_are_refused(lab):
     with pytest.raises(InputFileError, match="no such folder"):
         Catalog(str(lab / "none"))
@@ -337,6 +343,7 @@ def test_wrong_places_and_conditions_are_refused(lab):
         catalog.sql("selct 1")
 
 
+@pytest.mark.slow
 def test_the_command(lab, command, report_of):
     found = report_of("catalog", lab, "--where", "status = 'analysed'")
     assert [row["path"] for row in found["rows"]] == ["day1/gait.mcap"]

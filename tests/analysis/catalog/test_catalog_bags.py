@@ -16,6 +16,8 @@ from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError
 
+pytestmark = pytest.mark.slow
+
 KINDS = {
     "one.bag": {},
     "plain": {},

@@ -16,6 +16,8 @@ from undulog.analysis.catalog.files import CatalogFiles
 from undulog.analysis.catalog.sources import FOLDER
 from undulog.capture.common.errors import DamagedFileError
 
+pytestmark = pytest.mark.slow
+
 KINDS = ("sessions", "analyses", "joints", "sources")
 
 

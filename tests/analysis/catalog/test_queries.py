@@ -30,27 +30,30 @@ def files_below(folder):
     return sorted(str(path) for path in folder.rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize(
-    "condition",
-    [
-        "1=1; copy (select 1) to 'out.csv'",
-        "1=1; attach 'out.db'; --",
-        "path in (select content from read_text('secret.csv'))",
-        "path in (select a from read_csv('secret.csv'))",
-        "path in (select file from glob('/*'))",
+CONDITIONS = [
+    "1=1; copy (select 1) to 'out.csv'",
+    "1=1; attach 'out.db'; --",
+    "path in (select a from read_csv('secret.csv'))",
+    "not " * 20_000,
+    pytest.param("path in (select content from read_text('secret.csv'))", marks=pytest.mark.slow),
+    pytest.param("path in (select file from glob('/*'))", marks=pytest.mark.slow),
+    pytest.param(
         "1=1 union select * from read_parquet('lab/.undulog-catalog/sources/*.parquet') --",
-        "path in (select a from 'secret.csv')",
-        "1=1; set memory_limit = '64GB'",
-        "1=1; install httpfs",
-        "path in (select a from 'https://127.0.0.1:1/a.csv')",
-        "1=1; drop view catalog",
-        "path = 'a' or",
-        "\0",
-        "(" * 40_000,
-        "not " * 20_000,
-        "path = '" + "x" * 200_000 + "'",
-    ],
-)
+        marks=pytest.mark.slow,
+    ),
+    pytest.param("path in (select a from 'secret.csv')", marks=pytest.mark.slow),
+    pytest.param("1=1; set memory_limit = '64GB'", marks=pytest.mark.slow),
+    pytest.param("1=1; install httpfs", marks=pytest.mark.slow),
+    pytest.param("path in (select a from 'https://127.0.0.1:1/a.csv')", marks=pytest.mark.slow),
+    pytest.param("1=1; drop view catalog", marks=pytest.mark.slow),
+    pytest.param("path = 'a' or", marks=pytest.mark.slow),
+    pytest.param("\0", marks=pytest.mark.slow),
+    pytest.param("(" * 40_000, marks=pytest.mark.slow),
+    pytest.param("path = '" + "x" * 200_000 + "'", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
 def test_a_condition_reads_and_writes_nothing_else(lab, tmp_path, condition):
     before = files_below(tmp_path)
     with pytest.raises(UsageError, match="DuckDB") as refused:
@@ -122,6 +125,7 @@ PROMISED_S = 20
 """Most processor time that an input of any kind may take: docs/explanation/reliability.md."""
 
 
+@pytest.mark.slow
 def test_the_kernel_limits_the_processor_time_of_a_query_whose_end_is_told(lab):
     """Whole queries of that length are for the night; here SIGXCPU comes at once."""
     lab.sql("select 1")

@@ -46,6 +46,7 @@ def test_wrong_usage_is_refused_before_the_work(verb, options, message, command)
     assert err.startswith(f"error: {message}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["analyse", "report", "compare"])
 def test_a_bad_file_is_named_and_leaves_nothing_behind(verb, good, tmp_path, command):
     page = tmp_path / "out.html"

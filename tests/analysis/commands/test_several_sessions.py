@@ -39,12 +39,14 @@ def test_analyse_of_a_folder_is_a_table_and_a_list_of_results(folder, tmp_path, 
     assert "not an MCAP file" in found[1]["error"]
 
 
+@pytest.mark.slow
 def test_named_files_are_one_experiment_unless_each_is_asked_for(folder, command):
     files = folder / "a.mcap", folder / "sub/a.mcap"
     assert command("analyse", *files).out.startswith("2 sessions: ")
     assert command("analyse", *files, "--each").out.startswith("session ")
 
 
+@pytest.mark.slow
 def test_an_experiment_with_a_bad_file_fails_and_shows_which(folder, command):
     shown = command("analyse", folder / "a.mcap", folder / "bad.mcap", code=1)
     assert "not an MCAP file" in shown.err

@@ -79,6 +79,7 @@ def test_false_alarms_of_any_motion(amplitudes):
     assert false_alarms(amplitudes, 150) <= 0.05 + 3 * (0.05 * 0.95 / 150) ** 0.5
 
 
+@pytest.mark.slow
 def test_the_intervals_hold_the_planted_differences():
     change = np.array([1, 1.05, 1, 1, np.exp(-1j * np.radians(3)), 1])
     held, named = 0, 0

@@ -70,6 +70,7 @@ def test_the_weakened_joint_is_named_with_its_true_difference(write):
     assert any("one session a side" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_mean_cycles_differ_as_in_closed_form(write, wave):
     result = compared(write("a", 3), write("b", 4, late_s=0.2, change=weaken))
     before, after = (wave(np.random.default_rng(11), joints=5) for _ in range(2))
@@ -91,6 +92,7 @@ def test_two_runs_of_one_truth_are_equivalent(write):
     assert (result.verdict, result.answer, result.named) == ("same", alike, ())
 
 
+@pytest.mark.slow
 def test_a_session_is_the_same_as_itself(write):
     path = write("a", 7)
     result = compared(path, path)
@@ -108,6 +110,7 @@ def test_with_much_noise_the_question_stays_open(write):
         assert wide > 0.0
 
 
+@pytest.mark.slow
 def test_energy_alone_may_differ(write):
     result = compared(write("a", 10), write("b", 11, energy=1.2))
     assert result.verdict == "small"
@@ -118,6 +121,7 @@ def test_energy_alone_may_differ(write):
     assert ratios == pytest.approx([0.2] * 5, abs=0.01)
 
 
+@pytest.mark.slow
 def test_another_gait_is_refused_or_labelled(write):
     a, b = write("a", 12), write("b", 13, frequency=1.1)
     with pytest.raises(DataError, match=r"the gaits differ, .* b.mcap has 1.1 Hz, a.mcap 0.97 Hz"):
@@ -127,6 +131,7 @@ def test_another_gait_is_refused_or_labelled(write):
     assert result.answer.endswith("(partial comparison)")
 
 
+@pytest.mark.slow
 def test_another_amplitude_of_one_joint_is_another_gait(write):
     def louder(truth):
         truth.amplitude[3] *= 1.05
@@ -135,6 +140,7 @@ def test_another_amplitude_of_one_joint_is_another_gait(write):
         compared(write("a", 14), write("b", 15, change=louder))
 
 
+@pytest.mark.slow
 def test_other_joints_are_left_out_or_refused(write):
     a = write("a", 16)
     result = compared(a, write("b", 17, joints=4))

@@ -120,6 +120,7 @@ def test_a_clipped_sensor_has_none():
     assert found == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("witness", "kind"),
     [

@@ -97,6 +97,7 @@ def test_identical_modules_with_a_boundary_pattern(alike):
     assert result.warnings == ()
 
 
+@pytest.mark.slow
 def test_a_weak_module_is_named(weak):
     result = experiment(weak)
     assert result.answer == (
@@ -185,6 +186,7 @@ def test_a_robot_that_is_not_its_own_mirror_image():
     assert "mass or inertia" in mirror_fault(dataclasses.replace(ROBOT, links=tuple(links)), driven)
 
 
+@pytest.mark.slow
 def test_bags_without_a_robot_are_taken_as_a_chain(tmp_path):
     result = experiment(write_ways(tmp_path, runs=2, robot=None))
     assert (result.reversal.forward_runs, result.reversal.reverse_runs) == (2, 2)

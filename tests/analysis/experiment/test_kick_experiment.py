@@ -15,6 +15,8 @@ from support.linear_chain import M, asymmetry, within
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LocalCoupling
 
+pytestmark = pytest.mark.slow
+
 H, BASE = kick_tables.chain(M)
 TRUTH = H * BASE[None, :] / (H @ BASE)[:, None]
 SIGMA = 0.002

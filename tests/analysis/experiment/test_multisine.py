@@ -7,6 +7,8 @@ from scipy import signal
 from support.joint_runs import EPOCH_NS, turns, write_joints
 from undulog.capture import Session
 
+pytestmark = pytest.mark.slow
+
 RATE_HZ = 100
 NAMES = ("a", "b")
 PERIOD_S = 4.0

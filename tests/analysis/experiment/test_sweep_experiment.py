@@ -15,6 +15,8 @@ from undulog.analysis.results.coupling import LinearCoupling, Route
 from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
 
+pytestmark = pytest.mark.slow
+
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
 NAMES = tuple(ROBOT.joint_names[k] for k in YAW)

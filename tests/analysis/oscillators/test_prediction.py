@@ -175,6 +175,7 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, repo
     command(*words, "--force")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -189,12 +190,14 @@ def test_wrong_usage(result, words, code, message, command):
     assert message in command("predict", result[0], *words.split(), code=code).err
 
 
+@pytest.mark.slow
 def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):
     words = ("predict", result[1][0], "--eps", "0.3")
     assert "phase-kicks around this gait" in command(*words, code=1).err
     command("predict", code=2)
 
 
+@pytest.mark.slow
 def test_a_result_of_kicks_reads_back(result):
     from undulog.analysis import load
 

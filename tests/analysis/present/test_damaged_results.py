@@ -29,6 +29,7 @@ def whole(tmp_path_factory):
     return json.loads(path.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", OTHERS, ids=repr)
 def test_whatever_stands_there_it_is_a_result_or_a_sentence(other, whole, tmp_path):
     path, refused = tmp_path / "x.json", 0

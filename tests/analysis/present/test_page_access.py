@@ -74,6 +74,7 @@ def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     assert roles["rowheader"] > 0
 
 
+@pytest.mark.slow
 def test_figures_have_name_and_description(browser, address):
     browser.open(address)
     found = nodes(browser)

@@ -69,6 +69,7 @@ def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     assert (browser.requests(), browser.complaints()) == ([url], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dark", SCHEMES)
 @pytest.mark.parametrize("name", ["snake", "both_ways", "kicked"])
 def test_all_text_stands_out_from_its_ground(browser, address, name, dark):

@@ -21,6 +21,7 @@ def closed(words, which, folder, **options):
     return subprocess.run(shell, cwd=folder, env=env, check=False, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [">&-", "2>&-", "<&-", "<&- >&-", "<&- >&- 2>&-"])
 @pytest.mark.parametrize(("words", "code"), [(("info",), 0), (("log", "info", "none.mcap"), 1)])
 def test_a_command_with_closed_streams_ends_as_ever(which, words, code, tmp_path):

@@ -91,6 +91,7 @@ def test_the_same_bag_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "x.mcap").read_bytes() == (tmp_path / "y.mcap").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_response_of_an_import_is_that_of_the_bag(kind, tmp_path, report_of):
     name, storage = KINDS[kind]

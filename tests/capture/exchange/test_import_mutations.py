@@ -100,6 +100,7 @@ def test_mutated_traces_end_in_a_session_or_an_error_of_ours(suffix, traces, rob
         imported(path, robot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number",
     [pytest.param(n, marks=pytest.mark.nightly) if n in SIMILAR else n for n in NUMBERS],

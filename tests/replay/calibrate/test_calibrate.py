@@ -82,6 +82,7 @@ def test_a_dead_time_is_reported_and_not_written(small, tmp_path, report_of):
     assert high - low < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -106,6 +107,7 @@ def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, message, c
     assert (list(tmp_path.iterdir()), mine.read_text()) == ([mine], "mine")
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command):
     @contextmanager
     def interrupted():

@@ -10,6 +10,7 @@ import pytest
 from support.processes import listening, served_page, wait_for
 
 
+@pytest.mark.slow
 def test_save_writes_a_recording_and_reports_it(
     session_file, tmp_path, snake25, command, report_of
 ):

@@ -34,6 +34,7 @@ def test_every_message_is_shown(live, session_file, opened):
     assert report["lag_s"]["p50"] > 0
 
 
+@pytest.mark.slow
 def test_angles_and_power_are_those_that_were_measured(live, truth):
     _, drawn = live
     angle, scalar = "Angle:degrees", "Scalars:scalars"

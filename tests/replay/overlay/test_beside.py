@@ -184,6 +184,7 @@ def chord(wave, step_s):
     return np.rad2deg(fastest * step_s**2 / 8) + 2e-5  # and 32 bits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["time", "phase"])
 def test_differences_are_those_of_the_waves(beside, how):
     found, entity, joints = beside[how], "/compared/twin/angles", np.arange(len(NAMES))

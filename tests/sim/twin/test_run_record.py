@@ -79,6 +79,7 @@ def test_the_record_states_what_the_scenario_made_of_the_robot(folder):
         assert "contact_law" not in session.metadata[RUN_RECORD]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["run.mcap", "free.mcap"])
 def test_a_session_without_the_record_gives_the_same_facts(folder, file, opened):
     new, old = (opened(folder / name / file) for name in ("new", "old"))

@@ -72,6 +72,7 @@ def test_a_damaged_bag_is_named_with_the_fix(damage, tmp_path):
         Session.open(bag)
 
 
+@pytest.mark.slow
 @MODES
 @pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize("cases", [3, pytest.param(10, marks=pytest.mark.nightly)])

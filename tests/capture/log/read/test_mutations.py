@@ -73,6 +73,7 @@ def read_mutated(first, stop):
     return came
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "count"), [(0, 30), pytest.param(30, 270, marks=pytest.mark.nightly)]
 )

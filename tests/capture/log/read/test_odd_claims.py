@@ -65,6 +65,7 @@ def test_more_joints_than_are_judged_are_a_finding(tmp_path):
     assert any("/joint_commands has 2001 joints; at most 2000" in one for one in health.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start_ns", [2**63 - NS // 2, 2**63, 2**64 - 10 * NS])
 @pytest.mark.parametrize("whole", [True, False])
 def test_log_times_that_no_signed_number_holds(tmp_path, start_ns, whole, capsys):
