@@ -225,7 +225,13 @@ def _first_of_each_joint(answers: Sequence[Answer]) -> Judgement:
     changes = {change.joint: change for answer in answers[::-1] for change in answer.changes}
     extra = {motion.joint: motion for answer in answers[::-1] for motion in answer.extra}
     rests = {rest.joint: rest for answer in answers[::-1] for rest in answer.rests}
-    return Judgement((), tuple(changes.values()), tuple(extra.values()), tuple(rests.values()))
+    apart = {(each.joint, each.quantity): each for answer in answers[::-1] for each in answer.apart}
+    return Judgement(
+        changes=tuple(changes.values()),
+        extra=tuple(extra.values()),
+        rests=tuple(rests.values()),
+        apart=tuple(apart.values()),
+    )
 
 
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:

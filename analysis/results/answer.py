@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from undulog.capture.judgement.fault import Change, ExtraMotion, RestsOff
+from undulog.capture.judgement.fault import Apart, Change, ExtraMotion, RestsOff
 
 _MOST = 12
 """Digits after which two numbers are taken for equal."""
@@ -230,6 +230,7 @@ class Answer:
         changes: Changes of joints that follow, during the session.
         extra: Motion at frequencies that aren't the commands'.
         rests: Joints that rest off their command.
+        apart: Joints whose gain or lag lies apart from those of all others.
         stand_out: Joints that stand out, worst first.
         undecided: Why it can't be decided which joint differs, or what else may; None otherwise.
         shape: Shapes of the rest, those that explain most first; each simultaneous interval
@@ -244,6 +245,7 @@ class Answer:
     changes: tuple[Change, ...] = ()
     extra: tuple[ExtraMotion, ...] = ()
     rests: tuple[RestsOff, ...] = ()
+    apart: tuple[Apart, ...] = ()
     stand_out: tuple[StandOut, ...] = ()
     undecided: str | None = None
     shape: tuple[Shape, ...] = ()

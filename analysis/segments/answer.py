@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
-from undulog.capture.judgement.fault import NOTHING, Judgement, clause_of
+from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
@@ -95,6 +95,7 @@ def compose(facts: Facts) -> Answer:
         changes=facts.judgement.changes,
         extra=facts.judgement.extra,
         rests=facts.judgement.rests,
+        apart=_apart(facts),
         stand_out=findings.stand_out,
         undecided=_undecided(facts) or _boundary(facts) or None,
         shape=findings.shape,
@@ -166,8 +167,13 @@ def _named(facts: Facts) -> str:
         clauses.append(f"{', '.join(names)} do not follow either")
     if facts.judgement.naming:
         clauses.insert(0, plain(facts.judgement.naming))
-    differences = (*facts.judgement.changes, *facts.judgement.extra, *facts.judgement.rests)
+    judged = facts.judgement
+    rests = judged.rests if len(judged.rests) <= NAMED else ()
+    differences = (*judged.changes, *judged.extra, *_apart(facts), *rests)
     clauses += [clause_of(each, plain(each.joint)) for each in differences[:NAMED]]
+    if judged.rests and not rests:
+        most = math.degrees(max(abs(each.offset_rad) for each in judged.rests))
+        clauses.append(f"{len(judged.rests)} joints rest off their commands, up to {most:.2g}°")
     changed = {change.joint for change in facts.judgement.changes}
     by_joint: dict[str, list[StandOut]] = {}
     for each in facts.findings.stand_out:
@@ -189,15 +195,33 @@ def _named(facts: Facts) -> str:
     return f"{'; '.join(clauses)}." if clauses else ""
 
 
+def _apart(facts: Facts) -> tuple[Apart, ...]:
+    """Return the joints whose response lies apart, where no closer comparison names them."""
+    compared = {*facts.findings.compared}
+    return tuple(each for each in facts.judgement.apart if each.joint not in compared)
+
+
 def _left_out(facts: Facts) -> str:
-    """Driven joints that are neither compared nor named; empty where nothing was compared."""
+    """Driven joints that are neither compared nor named, and why if they moved too little.
+
+    Empty where nothing was compared, unless no joint could be judged.
+    """
     known = {*facts.findings.compared, *(each.joint for each in facts.not_following)}
-    names = [plain(name) for name in facts.commanded if name not in known]
-    if not names or not facts.findings.compared:
+    names = [name for name in facts.commanded if name not in known]
+    if not facts.findings.compared and facts.judgement.judged:
         return ""
-    listed = ", ".join(names[:NAMED])
-    listed += f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return f"Not compared: {listed}."
+    asked = {name: rad for name, rad in facts.judgement.unexposed if name in names}
+    rest = [name for name in names if name not in asked] if facts.findings.compared else []
+    most = math.degrees(max(asked.values(), default=0.0))
+    little = f"not asked to move enough to judge (at most {most:.2g} degrees commanded)"
+    sentences = [f"{_listed([*asked])}: {little}."] if asked else []
+    sentences += [f"Not compared: {_listed(rest)}."] if rest else []
+    return " ".join(sentences)
+
+
+def _listed(names: Sequence[str]) -> str:
+    listed = ", ".join(plain(name) for name in names[:NAMED])
+    return listed + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 def _scales(facts: Facts) -> str:
@@ -266,6 +290,7 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
     """Verdict, sentence and detail on the joints that are not named."""
     judged = facts.judgement
     named = bool(facts.not_following or judged.changes or judged.extra or judged.rests)
+    named |= bool(_apart(facts))
     named |= bool(facts.findings.stand_out or facts.findings.undecided or facts.findings.kinds)
     if facts.motion is not None or facts.gait.frequency_hz.value is None:
         about = "no command" if facts.motion is not None else "no gait"
@@ -355,7 +380,11 @@ def _compared(facts: Facts, *, named: bool) -> tuple[Verdict, str]:
         return Verdict.UNLIKE, ""
     shapes = _shapes(facts)
     if findings.alike and (named or _everyone(facts)):
-        left = len(findings.compared) - len({each.joint for each in findings.stand_out})
+        judged = facts.judgement
+        differ = (*findings.stand_out, *judged.changes, *judged.extra, *judged.rests)
+        left = len({*findings.compared} - {each.joint for each in differ})
+        named = named and left > 0
+        left = left or len(findings.compared)
         others = f"The other {left} joints" if named else f"The segments move alike: all {left}"
         rest = "move alike, within" if named else "joints are within"
         return Verdict.ALIKE, f"{others} {rest} 2 % of gain and 1 degree of lag."

@@ -12,7 +12,8 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.judgement.session import MOST_JOINTS
+from undulog.capture.judgement.publishers import are_of_two_nodes
+from undulog.capture.judgement.session import MOST_JOINTS, in_turn
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
 from undulog.capture.log.read.pauses import without_pauses
@@ -128,6 +129,12 @@ def read_columns(
     chosen = {"reference": reference_topic, "excitation": excitation_topic}
     chosen = {key: topic for key, topic in chosen.items() if topic is not None}
     wanted |= {key: (topic, "position") for key, topic in chosen.items()}
+    if topics.robots:
+        choices = (f"--command-topic {one} --response-topic {two}" for one, two in topics.robots)
+        raise DataError(
+            f"{session.path.name}: {len(topics.robots)} robots with joints of the same names; "
+            f"choose one: {', or '.join(choices)}"
+        )
     asked = [((command_topic, response_topic), HOW_TO_CHOOSE)]
     asked += [((topic,), f"choose with --{key}-topic") for key, topic in chosen.items()]
     for names, how in asked:
@@ -164,6 +171,9 @@ def read_columns(
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
+    for key, topic in (("command", command_topic), ("position", response_topic)):
+        if key in found and are_of_two_nodes(found[key].values):
+            raise DataError(f"{session.path.name}: {in_turn(topic)}; record one of them alone")
     _check_voltage(session, found, warn)
     seen = dict.fromkeys(session.robot.joint_names if session.robot is not None else ())
     for key in ("command", "position"):

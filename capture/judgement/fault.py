@@ -148,6 +148,30 @@ class RestsOff:
 
 
 @dataclass(frozen=True)
+class Apart:
+    """A joint whose response lies apart from those of all others.
+
+    Attributes:
+        quantity: ``gain`` or ``lag``.
+        value: Its gain, or its lag [s].
+        others: The least and the largest of the others.
+    """
+
+    joint: str
+    quantity: str
+    value: float
+    others: tuple[float, float]
+
+    @property
+    def text(self) -> str:
+        """E.g. ``lags by 0.21 s, the others by 0.1 to 0.12 s``."""
+        low, high = (f"{end:.2g}" for end in self.others)
+        if self.quantity == "lag":
+            return f"lags by {self.value:.2g} s, the others by {low} to {high} s"
+        return f"has a gain of {self.value:.2g}, the others of {low} to {high}"
+
+
+@dataclass(frozen=True)
 class Judgement:
     """What is found of the joints of a session.
 
@@ -156,6 +180,7 @@ class Judgement:
         changes: Of joints without a fault.
         extra: Of joints without a fault.
         rests: Of joints without a fault.
+        apart: Of joints without a fault, change or motion of their own.
         unexposed: Joints that were not asked to move enough to judge, with the largest motion that
             was asked of them [rad].
         judged: Joints that were.
@@ -166,12 +191,13 @@ class Judgement:
     changes: tuple[Change, ...] = ()
     extra: tuple[ExtraMotion, ...] = ()
     rests: tuple[RestsOff, ...] = ()
+    apart: tuple[Apart, ...] = ()
     unexposed: tuple[tuple[str, float], ...] = ()
     judged: tuple[str, ...] = ()
     naming: str = ""
 
 
-def clause_of(difference: Change | ExtraMotion | RestsOff, name: str) -> str:
+def clause_of(difference: Change | ExtraMotion | RestsOff | Apart, name: str) -> str:
     """Return a difference of one joint as a clause that begins with the joint's name."""
     return f"{name}{':' if isinstance(difference, Change) else ''} {difference.text}"
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
+from .apart import find_apart
 from .bursts import find_bursts
 from .changes import SHORTEST_S, WIDTH, Jump, find_jumps
 from .exposure import (
@@ -88,8 +89,9 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
             faults[name] = fault
     usable = usable_steps(course, exposure, stillness)
     names = [motion.name for motion in driven]
+    exposed: BoolArray = np.any(stillness.exposed, axis=1)
     usable[[name in faults for name in names]] = False
-    jumps = find_jumps(course, exposure, usable)
+    jumps = find_jumps(course, exposure, usable & exposed[:, None])
     for jump in [jump for jump in jumps if _ends(course, exposure, jump)]:
         like = [driven[j] for j in exposure.group(jump.joint)]
         faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)
@@ -101,19 +103,22 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
         if k not in changed:
             text = f"{100 * share:.2g} % of its samples are far from where it can be"
             faults[names[k]] = _whole(driven[k], ("noisy_sensor",), text)
-    exposed: BoolArray = np.any(stillness.exposed, axis=1)
+    lines = find_lines(course, exposure, usable)
+    moved = changed | {line.joint for line in lines}
+    left_out = [not sound or k in moved for k, sound in enumerate(healthy)]
     return Judgement(
         faults=tuple(faults[m.name] for m in motions if m.name in faults),
         changes=tuple(_change(names, jump) for jump in jumps),
         extra=tuple(
             ExtraMotion(names[line.joint], line.frequency_hz, line.amplitude_rad)
-            for line in find_lines(course, exposure, usable)
+            for line in lines
         ),
         rests=tuple(
             RestsOff(names[rest.joint], rest.offset_rad, rest.range_rad, rest.rests)
             for rest in find_rests(course, exposure, stillness)
             if healthy[rest.joint]
         ),
+        apart=tuple(find_apart(exposure, names, left_out)),
         unexposed=tuple(
             (name, float(np.ptp(course.command[k])))
             for k, name in enumerate(names)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
+from .shifts import rank_correlation
 
 LARGEST_COURSE = 1 << 16
 """Steps of a course at most: an hour at 18 Hz, ten samples a cycle of the fastest gaits. Memory and
@@ -214,6 +215,4 @@ def is_sweep(command: FloatArray) -> bool:
     lengths = np.diff(rises_of(command))
     if lengths.size < 3 or lengths.min() == lengths.max():
         return False
-    _, which, counts = np.unique(lengths, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(counts) - counts / 2)[which]  # equal lengths share the middle of their ranks
-    return bool(abs(np.corrcoef(ranks, np.arange(lengths.size))[0, 1]) > SWEPT)
+    return abs(rank_correlation(lengths)) > SWEPT

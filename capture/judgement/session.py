@@ -17,6 +17,7 @@ from ..robot.model import Joint, Seat
 from .fault import Judgement
 from .judge import judge
 from .motion import JointMotion, Samples
+from .publishers import are_of_two_nodes
 
 MOST_JOINTS = 2000
 """Of a session whose joints are judged; a file that claims more of them describes no robot."""
@@ -56,12 +57,20 @@ def judgement_of_session(session: SessionView) -> Judgement:
         columns[quantity] = {name: signals.signal(name) for name in signals.names}
     if "command" not in columns or "position" not in columns or times_made(session):
         return Judgement()
+    for quantity in ("command", "position"):
+        if are_of_two_nodes(signal.values for signal in columns[quantity].values()):
+            return Judgement(naming=in_turn(quantities[quantity][0]))
     both = (*columns["command"].values(), *columns["position"].values())
     whole = longest_unbroken(signal.t_ns for signal in both)
     if whole is None:
         return Judgement()
     window_ns = (whole.start_ns, whole.last_ns + 1) if whole.others else None
     return judge(motions_of(session, columns, columns["command"], window_ns))
+
+
+def in_turn(topic: str) -> str:
+    """Say that two nodes publish a topic."""
+    return f"two nodes publish {topic} in turn: every other sample belongs to another series"
 
 
 def times_made(session: SessionView) -> bool:

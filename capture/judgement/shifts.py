@@ -30,6 +30,9 @@ FEWEST = 8
 ROBUST = 1.4826
 """Standard deviation of normal values in their median distance from the middle."""
 
+TINY = float(np.finfo(np.float64).tiny)
+"""What stands for 0 in a denominator."""
+
 TAME = 4
 """Robust standard deviations of a block beyond which a sample has no more weight: of normal noise
 6 in 100,000 are, and single samples of heavy tails decide nothing (Huber)."""
@@ -132,7 +135,7 @@ def largest_shift(
             start = 0 if first[k] == 0 else int(known[first[k]])
             stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
             inner = float(w[first[k] : last[k]].sum())
-            drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, 1e-300))
+            drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, TINY))
             means = _means(v, w, int(first[k]), int(last[k]))
             size = float(change[k]) if means is None else means[0] - means[1]
             run = Shift(size, float(outside[k]), float(error[k]), start, stop, drop)
@@ -157,10 +160,26 @@ def drift_of(values: FloatArray, weights: FloatArray, rho: float, tests: int) ->
     change = float(w @ (x * v)) / power
     left = v - float(w @ v) / float(w.sum()) - change * x
     freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
-    error = max(float(w @ left**2) / freedom / power, 1e-300) ** 0.5
-    if abs(change) < -float(stdtrit(max(freedom, 1.0), LEVEL / 2 / tests)) * error:
+    error = max(float(w @ left**2) / freedom / power, TINY) ** 0.5
+    limit = -float(stdtrit(max(freedom, 1.0), LEVEL / 2 / tests))
+    # Heavy tails make slopes, and no order of ranks.
+    rank = abs(rank_correlation(v))
+    by_rank = rank * (freedom / max(1 - rank**2, TINY)) ** 0.5
+    if min(abs(change) / error, by_rank) < limit:
         return None
     return Shift(change, float(w @ v) / float(w.sum()), error, 0, values.size, change**2 * power)
+
+
+def rank_correlation(values: FloatArray) -> float:
+    """Return the correlation of the ranks of values with their order (Spearman), -1 to 1.
+
+    Equal values share the middle of their ranks; 0 where all are equal.
+    """
+    _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
+    if counts.size < 2:
+        return 0.0
+    ranks = (np.cumsum(counts) - counts / 2)[which]
+    return float(np.corrcoef(ranks, np.arange(values.size))[0, 1])
 
 
 def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, float] | None:
@@ -209,10 +228,10 @@ def _fitted(
     along = own + begin[first] * whole[first] + behind * whole[after]
     moment = of_target + begin[first] * target[first] + behind * target[after]
     level, total = sums[0, -1], sums[1, -1]
-    free = np.maximum(power - along**2 / level, 1e-300)
+    free = np.maximum(power - along**2 / level, TINY)
     change = (moment - along * total / level) / free
     left = float(target @ target) - total**2 / level - change**2 * free
-    variance = np.maximum(left, 1e-300) / max(v.size - 3, 1) / free
+    variance = np.maximum(left, TINY) / max(v.size - 3, 1) / free
     return change, (total - change * along) / level, np.sqrt(variance)
 
 
@@ -225,7 +244,7 @@ def _plain_error(
     (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
     squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
     freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
-    return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), 1e-300))
+    return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), TINY))
 
 
 def _whitened(values: FloatArray, rho: float) -> FloatArray:

@@ -154,6 +154,7 @@ def test_a_full_device_behind_the_output_is_an_error(words):
     assert done.stderr == "error: the output can't be written: No space left on device\n"
 
 
+@pytest.mark.slow
 def test_reading_a_robot_loads_python_can_only_when_it_is_used():
     code = (
         "import sys; from undulog.capture.common.extras import defer; defer();"

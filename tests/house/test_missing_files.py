@@ -86,10 +86,16 @@ def there(tmp_path_factory):
 KINDS = ["empty", "several", "rosbag2", "rosbag2 of sqlite3"]
 
 
+def when(number):
+    """Return the mark of a case: one of eight is fast, and one slow."""
+    tried = number % (2 * len(KINDS))
+    return {1: (), 1 + len(KINDS): pytest.mark.slow}.get(tried, pytest.mark.nightly)
+
+
 @pytest.mark.parametrize(
     ("line", "kind"),
     [
-        pytest.param(line, kind, marks=() if (n + m) % len(KINDS) == 1 else pytest.mark.nightly)
+        pytest.param(line, kind, marks=when(n + m))
         for n, line in enumerate(LINES)
         for m, kind in enumerate(KINDS)
     ],

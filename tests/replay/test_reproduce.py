@@ -127,6 +127,7 @@ def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
     assert "Not compared: " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

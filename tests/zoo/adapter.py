@@ -163,6 +163,7 @@ def stated(signals: Signals) -> Said:
         *(Different(one.joint, one.quantity, one.change, one.from_s) for one in answer.changes),
         *(Different(one.joint, "motion", one.amplitude_rad, None) for one in answer.extra),
         *(Different(one.joint, "rest", one.offset_rad, None) for one in answer.rests),
+        *(Different(one.joint, one.quantity, _beyond(one), None) for one in answer.apart),
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
     not_decided = answer.undecided is not None or answer.verdict in open_verdicts
@@ -174,6 +175,12 @@ def stated(signals: Signals) -> Said:
         not_decided=not_decided,
         sentence=answer.sentence,
     )
+
+
+def _beyond(apart):
+    """Return how far a joint is from the middle of the others: of a gain relative to it."""
+    middle = sum(apart.others) / 2
+    return apart.value / middle - 1 if apart.quantity == "gain" else apart.value - middle
 
 
 class MemorySession:

@@ -407,7 +407,9 @@ def judge_following(fault: JointFault) -> Finding:
 
 
 def judge_differences(judgement: Judgement) -> Iterator[Finding]:
-    """Yield findings on joints that changed, or that move besides their command."""
+    """Yield findings on joints that changed, or that move besides their command, and on names."""
+    if judgement.naming:
+        yield Finding(1, judgement.naming)
     for difference in (*judgement.changes, *judgement.extra):
         yield Finding(1, clause_of(difference, difference.joint))
 

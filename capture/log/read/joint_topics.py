@@ -169,6 +169,8 @@ class JointTopics:
         others: Other names that could be commands or responses.
         notes: What was found by its type, and interfaces that have no topic in the log contract.
         unnamed: Why arrays that could be the commands are none, where no other topic is.
+        robots: Commands and responses of each of several robots with joints of the same names;
+            none of them is taken.
     """
 
     command: str = COMMAND_TOPIC
@@ -177,6 +179,7 @@ class JointTopics:
     others: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     unnamed: tuple[str, ...] = ()
+    robots: tuple[tuple[str, str], ...] = ()
 
     @property
     def renamed(self) -> dict[str, str]:
@@ -194,6 +197,26 @@ class _Candidate:
     rank: int
     count: int
     joints: tuple[str, ...]
+
+
+def _robots(
+    commands: Sequence[_Candidate], responses: Sequence[_Candidate]
+) -> tuple[tuple[str, str], ...]:
+    """Return the topics of each of several robots: of one namespace, with joints that others have.
+
+    Empty for one robot, and for several whose joints differ: their names part them.
+    """
+    pairs: dict[str, tuple[_Candidate, _Candidate]] = {}
+    for command in commands:
+        space = command.topic.rpartition("/")[0]
+        of_it = (one for one in responses if one.topic.rpartition("/")[0] == space)
+        state = next((one for one in of_it if one.topic != command.topic), None)
+        if state is not None and {*command.joints} & {*state.joints}:
+            pairs.setdefault(space, (command, state))
+    every = Counter(name for _, state in pairs.values() for name in {*state.joints})
+    if max(every.values(), default=0) < 2:
+        return ()
+    return tuple(sorted((command.name, state.name) for command, state in pairs.values()))
 
 
 def _sorted(candidates: Iterable[_Candidate], without: str) -> list[_Candidate]:
@@ -245,15 +268,28 @@ class JointTopicFinder:
         commands = _sorted(self._commands(every), response)
         responses = _sorted(self._responses(every), command)
         taken: dict[str, str] = {}
+        robots = _robots(commands, responses)
+        if len(search) > 1 and robots:
+            return JointTopics(quantities=quantities, notes=notes, robots=robots)
         known = every.get(response, ())
         if COMMAND_TOPIC in search and commands:
-            # Of several controllers one that has joints of the responses.
-            best = min(commands, key=lambda one: (known and not {*one.joints} & {*known}, one.rank))
+            # Of several controllers one that has joints of the responses, of several robots theirs.
+            best = min(
+                commands,
+                key=lambda one: (
+                    known and not {*one.joints} & {*known},
+                    one.rank,
+                    (one.name, response) not in robots,
+                ),
+            )
             command = taken["commands"] = best.name
         if RESPONSE_TOPIC in search and responses:
             source = joint_source(command, channels)
             own = "" if source is None else source.topic
-            best = min(responses, key=lambda one: (one.rank, one.topic != own))
+            best = min(
+                responses,
+                key=lambda one: (one.rank, one.topic != own, (command, one.name) not in robots),
+            )
             if best.rank < _UNNAMED or sum(one.rank == _UNNAMED for one in responses) == 1:
                 response = taken["positions"] = best.name
         if set(every.get(response, ())).isdisjoint(self._names_of(command, every)):

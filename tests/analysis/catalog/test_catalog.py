@@ -221,6 +221,7 @@ def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left, opened):
     assert not len(catalog.find())
 
 
+@pytest.mark.slow
 def test_parts_of_a_session_are_one_row(tmp_path):
     sink = recorder.open_sink(tmp_path / "run.mcap")
     for number in range(900):

@@ -183,7 +183,7 @@ def all_simulations(monkeypatch):
     monkeypatch.undo()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("all_simulations")
 def test_of_fifty_fleets_with_memory_and_without_changes_hardly_any_has_one():
     case = fleet_tables.Case("rho 0.6, 20 sessions", 0.6, sessions=(20, 20))

@@ -155,6 +155,7 @@ def test_errors_come_back_as_what_they_are(lab, tmp_path):
     assert damaged.value.path.name == path.name
 
 
+@pytest.mark.slow
 def test_a_query_process_that_is_killed_is_replaced(lab):
     lab.sql("select 1")
     process = query_process()._process

@@ -100,6 +100,7 @@ def test_without_a_browser_the_message_says_what_to_do(tmp_path, monkeypatch, co
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -129,7 +130,7 @@ def test_a_browser_that_hangs_is_ended_with_its_children(tmp_path):
     assert processes_of(tmp_path) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ctrl_c_ends_the_browser(short, tmp_path):
     out = tmp_path / "out"
     out.mkdir()

@@ -225,6 +225,7 @@ def test_groups_and_pairs_by_the_command_line(write, tmp_path, command, report_o
     assert "a copy is not a run of its own" in err
 
 
+@pytest.mark.slow
 def test_commands_on_one_side_only_are_refused(write):
     a, b = write("a", 40), write("b", 41, commands=True)
     with pytest.raises(DataError, match=r"a\.mcap has no logged commands, b\.mcap has"):

@@ -101,6 +101,7 @@ def test_a_session_is_the_same_as_itself(write):
     assert any("the same content" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_with_much_noise_the_question_stays_open(write):
     result = compared(write("a", 8), write("b", 9), session=Options(start_s=0.0, stop_s=3.3))
     assert result.verdict in ("same", "open")

@@ -127,6 +127,7 @@ def test_what_is_left_of_a_kick_has_an_interval():
     assert np.mean(inside) >= 0.91
 
 
+@pytest.mark.slow
 def test_the_limits_are_stated():
     coupling = measured()[2]
     known = dataclasses.replace(coupling, valid_to=0.1)

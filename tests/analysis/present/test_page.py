@@ -83,6 +83,7 @@ def numbers(cell):
     return [float(d.attributes["value"]) for d in cell.all("data")]
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_outside(page):
     root = tree(page)
     for node in root.all():

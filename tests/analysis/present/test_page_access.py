@@ -98,6 +98,7 @@ BEYOND = """
 """
 
 
+@pytest.mark.slow
 def test_on_paper_nothing_is_cut(browser, address):
     browser.open(address, width=int(PORTRAIT_PX), media="print")
     assert browser.evaluate(BEYOND) == []

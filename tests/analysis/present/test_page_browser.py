@@ -80,6 +80,7 @@ def test_all_text_stands_out_from_its_ground(browser, address, name, dark):
     assert browser.evaluate(CONTRAST) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [360, 400, 820, 1280])
 @pytest.mark.parametrize("name", ["snake", "both_ways", "kicked"])
 def test_the_page_itself_never_scrolls_sideways(browser, address, name, width):
@@ -88,6 +89,7 @@ def test_the_page_itself_never_scrolls_sideways(browser, address, name, width):
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 720])
 @pytest.mark.parametrize("name", ["snake", "both_ways", "kicked"])
 def test_no_label_of_a_figure_is_cut_off(browser, address, name, width):
@@ -102,6 +104,7 @@ def test_no_label_of_a_figure_is_cut_off(browser, address, name, width):
     assert browser.evaluate(outside) == []
 
 
+@pytest.mark.slow
 def test_the_tab_key_reaches_the_skip_link_first_and_every_figure(browser, address):
     browser.open(address("snake"))
     name = "(e => e.getAttribute('aria-label') || e.textContent)(document.activeElement)"

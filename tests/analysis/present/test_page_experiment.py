@@ -37,6 +37,7 @@ def rows(page, table):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["both_ways", "kicked", "swept"])
 def test_the_answer_is_the_first_heading(pages, name, request):
     heading = re.search(r"<h1[^>]*>(.*?)</h1>", pages[name], re.DOTALL)[1]

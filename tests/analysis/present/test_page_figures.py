@@ -72,6 +72,7 @@ def test_pointing_at_a_mark_shows_joint_value_interval_and_unit(page, snake, num
     assert page.evaluate(TIP) is None
 
 
+@pytest.mark.slow
 def test_a_drag_zooms_and_the_new_ticks_are_true(page, snake):
     before = page.evaluate("document.querySelector('[aria-labelledby=segments] svg').innerHTML")
     left, top, right, bottom = panel(page, 1)["frame"]

@@ -39,6 +39,7 @@ def test_topics_that_were_not_recorded_are_no_warnings(tmp_path, opened):
     assert (shown["warnings"], shown["notes"]) == ([], list(found.notes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["text", "page"])
 def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, command):
     path = write(tmp_path / "s.mcap")

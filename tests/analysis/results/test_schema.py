@@ -72,14 +72,14 @@ def test_an_experiment_of_each_kind(experiment, tmp_path, report_of):
     assert faults("experiment", result) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_comparison(tmp_path, report_of):
     before, _, after, *_ = linear_chain.both_ways(tmp_path)
     assert faults("comparison", report_of("compare", before, after)) == []
     assert faults("comparison", report_of("compare", GOLDEN, GOLDEN)) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_prediction(tmp_path, report_of):
     runs = linear_chain.kicked(tmp_path)
     assert (

@@ -101,7 +101,7 @@ def runs(folder, *, weak, apart=False):
     return paths
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_reversal_takes_all_groups_together(tmp_path):
     result = experiment(runs(tmp_path, weak=0.95 * np.exp(-0.03j)))
     assert result.reversal is not None

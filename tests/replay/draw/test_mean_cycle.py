@@ -127,7 +127,7 @@ def test_the_twins_interval_is_as_narrow_as_its_cycles_agree(twin):
     assert np.degrees(1e-3) > (high - low).max()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_cycles_agree_with_the_reports_maps(twin, opened):
     measured = measure_session(opened(twin[0]))
     maps = cycle_maps(measured)

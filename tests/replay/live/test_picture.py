@@ -50,6 +50,7 @@ def test_angles_and_power_are_those_that_were_measured(live, truth):
         np.testing.assert_allclose(list(found.values()), values, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "component"),
     [

@@ -203,6 +203,7 @@ def test_differences_are_those_of_the_waves(beside, how):
     assert found.static(entity, "SeriesLines:names") == list(NAMES)
 
 
+@pytest.mark.slow
 def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     """Both go the same way in worlds of their own, so by time the heads part as one slows down."""
     found = beside["time"]
@@ -281,6 +282,7 @@ def still(make, tmp_path_factory):
     return make(tmp_path_factory.mktemp("still") / "still.mcap", Wave(seconds=2.0), gait=False)
 
 
+@pytest.mark.slow
 def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make, tmp_path, command):
     back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
     none = "no phase of a gait was logged (/gait) in still; align by --align time"

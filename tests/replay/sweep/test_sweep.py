@@ -88,7 +88,7 @@ def test_a_dry_run_runs_nothing(reference, tmp_path, command, report_of):
     assert (there["to_run"], there["estimated_s"]) == (0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_failed_run_keeps_its_error_and_can_be_run_again(tmp_path):
     plan = write_plan(tmp_path, (0.3, -1.0, "strong", 0.2))
     report, code = swept(plan, tmp_path / "rows")
@@ -158,7 +158,7 @@ def temporary(tmp_path, monkeypatch):
     wait_for(lambda: not list(folder.iterdir()), "temporary files are removed", 20)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("temporary")
 @pytest.mark.parametrize(
     "signals",
@@ -247,7 +247,7 @@ def test_rows_damaged_during_the_sweep_are_not_called_complete(tmp_path):
     assert (again.complete, again.run, again.damaged) == (True, 1, ())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sweeps_in_turn_share_the_processes(tmp_path):
     """Also where one of them is killed between two sweeps."""
     plan, seen = read_plan(write_plan(tmp_path)), []

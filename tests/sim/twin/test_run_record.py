@@ -103,6 +103,7 @@ def test_a_session_without_the_record_gives_the_same_numbers(folder, report_of, 
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_every_edit_keeps_the_record(folder, tmp_path, command, report_of, opened):
     run = folder / "new" / "run.mcap"
     names = ("a.mcap", "b.mcap", "m.mcap", "r.mcap", "x.mcap")

@@ -57,6 +57,7 @@ def test_a_clean_session_is_good_without_a_finding(clean, command):
     assert "0 messages dropped in 2 channels" in report
 
 
+@pytest.mark.slow
 def test_json_is_one_object_and_has_whether_the_stored_verdict_differs(write, command):
     found = json.loads(command("log", "check", write(verdict="bad"), "--json").out)
     assert found["verdict"] == "good"
@@ -82,18 +83,21 @@ def test_gaps_are_counted_measured_and_placed(write):
     assert health.reasons == (f"/joint_states: {reason}",)
 
 
+@pytest.mark.slow
 def test_one_short_gap_is_noted_and_no_fault(write):
     health = check_session(write(lost=lambda tick: tick == 700))
     assert health.verdict == "good"
     assert "1 gaps, 1 samples missing" in health.notes[0]
 
 
+@pytest.mark.slow
 def test_a_tenth_lost_is_bad_and_exits_1(write, command):
     path = write(lost=lambda tick: tick % 8 == 1)
     assert check_session(path).verdict == "bad"
     command("log", "check", path, code=1)
 
 
+@pytest.mark.slow
 def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(write):
     once = check_session(write(lost=lambda tick: 400 <= tick < 900))
     assert once.verdict == "degraded"
@@ -102,11 +106,13 @@ def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(write):
     assert check_session(write(lost=lambda tick: 400 <= tick < 1500)).verdict == "bad"
 
 
+@pytest.mark.slow
 def test_a_series_that_ends_early_is_reported(write):
     health = check_session(write(lost=lambda tick: tick >= 1500))
     assert health.reasons == ("/joint_states: ends 5 s before the session",)
 
 
+@pytest.mark.slow
 def test_repeated_and_backward_stamps_are_counted(write):
     def edit(tick, *_):
         return at(tick - (tick % 200 == 100) - 3 * (tick in {450, 850}))
@@ -185,6 +191,7 @@ def test_what_sequence_numbers_prove(numbers, kind, dropped):
 # -- planted in the values ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nan_is_counted_by_joint(write):
     def edit(tick, command, angles):
         angles[4] = np.nan if 100 <= tick < 150 else angles[4]
@@ -235,6 +242,7 @@ def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(write):
     assert following.endswith("its velocity goes on: frozen_sensor or dead")
 
 
+@pytest.mark.slow
 def test_half_of_the_joints_frozen_is_bad(write):
     def edit(tick, command, angles):
         angles[:13] = 0.1
@@ -242,6 +250,7 @@ def test_half_of_the_joints_frozen_is_bad(write):
     assert check_session(write(edit)).verdict == "bad"
 
 
+@pytest.mark.slow
 def test_a_joint_held_at_its_limit_is_named_and_a_full_stroke_is_not(write):
     limit = ROBOT.joints[0].upper
 

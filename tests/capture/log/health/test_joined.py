@@ -33,6 +33,7 @@ def lost(path, *, of_topic=None, whole=True, servos=False):
     return check_session(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("servos", [False, True])
 @pytest.mark.parametrize("whole", [False, True])
 def test_one_lost_bus_cycle_is_one_reason(tmp_path, whole, servos):

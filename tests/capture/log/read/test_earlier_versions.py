@@ -48,6 +48,7 @@ def test_each_opens_with_every_message_and_no_warning(session_file):
         assert session.warnings == []
 
 
+@pytest.mark.slow
 def test_each_is_checked_analysed_and_exported(session_file, command):
     shown = json.loads(command("log", "check", session_file, "--json").out)
     assert shown["verdict"] == "good"

@@ -221,3 +221,32 @@ def test_stamps_of_trajectories_are_on_the_clock_of_the_log(tmp_path):
             assert session.joints(topic).t_ns[0][0] == EPOCH_NS + 10**8
         window = session.joints("/stamped", start_ns=EPOCH_NS + 2 * 10**8)
         assert len(window.t_ns[0]) == 10
+
+
+def two_snakes(own, *tick):
+    """Two robots of the same joints; the commands of b and the states of a have most messages."""
+    for space, commands, states in (("/a", 1, 2), ("/b", 2, 1)):
+        for step in range(commands):
+            own.state(tick[0] + step, tick[1], f"{space}/joint_commands")
+        for step in range(states):
+            own.state(tick[0] + step, tick[1], f"{space}/joint_states")
+
+
+def test_the_commands_of_one_robot_are_never_paired_with_the_states_of_another(tmp_path):
+    with opened(tmp_path, two_snakes) as session:
+        found = session.joint_topics()
+        pairs = {(f"/{x}/joint_commands", f"/{x}/joint_states") for x in "ab"}
+        assert {*found.robots} == pairs
+        assert not found.renamed
+        for command, response in pairs:
+            assert session.joint_topics(command).response == response
+            assert session.joint_topics(response=response).command == command
+
+
+def test_an_analysis_of_two_robots_asks_which_one(tmp_path, command):
+    with opened(tmp_path, two_snakes) as session:
+        path = session.path
+    err = command("analyse", path, code=1).err
+    assert "2 robots with joints of the same names" in err
+    assert "--command-topic /a/joint_commands --response-topic /a/joint_states" in err
+    assert "--command-topic /b/joint_commands --response-topic /b/joint_states" in err
