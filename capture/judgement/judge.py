@@ -20,6 +20,7 @@ from .bursts import find_bursts
 from .changes import SHORTEST_S, WIDTH, Jump, find_jumps
 from .exposure import (
     COHERENT,
+    LARGEST_REST_RAD,
     RESPONDS,
     REST_ERRORS,
     Exposure,
@@ -91,7 +92,8 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     names = [motion.name for motion in driven]
     exposed: BoolArray = np.any(stillness.exposed, axis=1)
     usable[[name in faults for name in names]] = False
-    jumps = find_jumps(course, exposure, usable & exposed[:, None])
+    asked: BoolArray = np.ptp(course.command, axis=1) > LARGEST_REST_RAD
+    jumps = find_jumps(course, exposure, usable & asked[:, None])
     for jump in [jump for jump in jumps if _ends(course, exposure, jump)]:
         like = [driven[j] for j in exposure.group(jump.joint)]
         faults[names[jump.joint]] = _ended(driven[jump.joint], jump, like)

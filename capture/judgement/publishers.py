@@ -36,6 +36,5 @@ def _in_turn(values: FloatArray) -> bool | None:
     if near < RESPONDS * np.std(values) or next_but_one > COHERENT * near:
         return False
     even, odd = (part - part.mean() for part in (values[: values.size // 2 * 2 : 2], values[1::2]))
-    power = (float(even @ even), float(odd @ odd))
-    mirrored = even @ odd < -COHERENT * (power[0] * power[1]) ** 0.5
-    return max(power) > 0 and not mirrored
+    mirrored = np.mean(even * odd) < -COHERENT * np.std(even) * np.std(odd)
+    return bool(max(np.std(even), np.std(odd)) > RESPONDS * near and not mirrored)
