@@ -174,10 +174,12 @@ def _named(facts: Facts) -> str:
     if judged.rests and not rests:
         most = math.degrees(max(abs(each.offset_rad) for each in judged.rests))
         clauses.append(f"{len(judged.rests)} joints rest off their commands, up to {most:.2g}°")
-    changed = {change.joint for change in facts.judgement.changes}
+    changed = {change.joint for change in judged.changes}
+    off = {rest.joint for rest in judged.rests}
     by_joint: dict[str, list[StandOut]] = {}
     for each in facts.findings.stand_out:
-        if each.joint in changed:  # what the mean of before and after shows
+        # What the mean of before and after shows, or a rest has shown.
+        if each.joint in changed or (each.quantity == "offset" and each.joint in off):
             continue
         by_joint.setdefault(each.joint, []).append(each)
     for joint, several in list(by_joint.items())[:NAMED]:

@@ -15,7 +15,7 @@ from math import inf
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from .exposure import ENOUGH_LIKE, Exposure
+from .exposure import ENOUGH_LIKE, LIKE_LAG_S, RESPONDS, Exposure
 from .motion import Course, cycle_s, is_sweep
 from .shifts import (
     FEWEST,
@@ -160,8 +160,11 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
         return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
     inside = slice(run.first, run.last)
     _, motion, rate, count = blocks.weights[:, k]
-    if blocks.swept[k]:  # another time is another frequency
-        return False
+    lasting = run.first == 0 or run.last == count.size
+    if blocks.swept[k]:  # another time is another frequency, to which each joint responds
+        least = RESPONDS if quantity == "gain" else LIKE_LAG_S
+        if not (compared and lasting and abs(run.change) > least):
+            return False
     samples = max(float(count[inside].sum()), 1.0)
     amplitude = max((2 * float(motion[inside].sum()) / samples) ** 0.5, 1e-9)
     if quantity == "gain":

@@ -129,8 +129,8 @@ class RestsOff:
     Attributes:
         offset_rad: Position less command at rest, the largest [rad].
         range_rad: The least and the largest [rad].
-        rests: Number of rests; 0 where the command never rests: then the offset is the median of
-            all times.
+        rests: Number of rests; 0 where the command never rests: then the offset is that of the
+            response at the command's median.
     """
 
     joint: str

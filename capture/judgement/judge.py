@@ -112,8 +112,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
         faults=tuple(faults[m.name] for m in motions if m.name in faults),
         changes=tuple(_change(names, jump) for jump in jumps),
         extra=tuple(
-            ExtraMotion(names[line.joint], line.frequency_hz, line.amplitude_rad)
-            for line in lines
+            ExtraMotion(names[line.joint], line.frequency_hz, line.amplitude_rad) for line in lines
         ),
         rests=tuple(
             RestsOff(names[rest.joint], rest.offset_rad, rest.range_rad, rest.rests)

@@ -2,9 +2,8 @@
 
 The command rests where it moves less than an encoder would show for longer than the settling; the
 mean of the position less the command there, over the rests of a session, is the rest's error. Of a
-command that never rests it is the median of position less command over all times, where no like
-joints tell more. It is a difference, no fault: proportional control without an integral part leaves
-it.
+command that never rests it is how far the response is from the command at the command's median. It
+is a difference, no fault: proportional control without an integral part leaves it.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import FloatArray
-from .exposure import LARGEST_REST_RAD, Exposure
+from .exposure import LARGEST_REST_RAD, Exposure, responds
 from .motion import Course
 from .stillness import Stillness
 
@@ -45,14 +44,18 @@ def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list
     for k in range(course.position.shape[0]):
         off = _rests(course, exposure, stillness, k)
         rests = len(off)
-        if not off and len(exposure.group(k)) == 1:
-            error = course.position[k] - course.command[k]
-            kept = error[course.present[k] & ~stillness.stands[k]]
-            off = [float(np.median(kept))] if kept.size else []
+        if not off:
+            off = [_middle(course, exposure, k)] if responds(exposure.responses[k]) else []
         most = max(off, key=abs, default=0.0)
         if abs(most) > LARGEST_REST_RAD:
             found.append(RestOff(k, most, (min(off), max(off)), rests))
     return found
+
+
+def _middle(course: Course, exposure: Exposure, k: int) -> float:
+    """Return how far a joint's response is from its command at the middle of the command [rad]."""
+    response = exposure.responses[k]
+    return response.offset_rad + (response.gain - 1) * float(np.median(course.command[k]))
 
 
 def _rests(course: Course, exposure: Exposure, stillness: Stillness, k: int) -> list[float]:
