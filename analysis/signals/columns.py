@@ -15,7 +15,11 @@ from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.judgement.publishers import are_of_two_nodes
 from undulog.capture.judgement.session import MOST_JOINTS, in_turn
 from undulog.capture.log.messages.definitions import PowerTopic
-from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
+from undulog.capture.log.read.joint_topics import (
+    HOW_TO_CHOOSE,
+    RESPONSE_TOPIC,
+    JointTopics,
+)
 from undulog.capture.log.read.pauses import without_pauses
 from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
 from undulog.capture.robot.model import Robot
@@ -113,9 +117,11 @@ def read_columns(
     Raises:
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
             lists those that are.
-        DataError: If a topic has no joints, or there are too many joints.
+        DataError: If a topic has no joints, there are too many joints, it isn't known which of
+            several robots is meant, or two nodes publish a topic in turn.
     """
     topics = session.joint_topics(command_topic, response_topic)
+    _check_robots(session, topics)
     command_topic, response_topic = topics.command, topics.response
     wanted = {
         "command": (command_topic, "position"),
@@ -129,12 +135,6 @@ def read_columns(
     chosen = {"reference": reference_topic, "excitation": excitation_topic}
     chosen = {key: topic for key, topic in chosen.items() if topic is not None}
     wanted |= {key: (topic, "position") for key, topic in chosen.items()}
-    if topics.robots:
-        choices = (f"--command-topic {one} --response-topic {two}" for one, two in topics.robots)
-        raise DataError(
-            f"{session.path.name}: {len(topics.robots)} robots with joints of the same names; "
-            f"choose one: {', or '.join(choices)}"
-        )
     asked = [((command_topic, response_topic), HOW_TO_CHOOSE)]
     asked += [((topic,), f"choose with --{key}-topic") for key, topic in chosen.items()]
     for names, how in asked:
@@ -171,9 +171,7 @@ def read_columns(
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
-    for key, topic in (("command", command_topic), ("position", response_topic)):
-        if key in found and are_of_two_nodes(found[key].values):
-            raise DataError(f"{session.path.name}: {in_turn(topic)}; record one of them alone")
+    _check_nodes(session, found)
     _check_voltage(session, found, warn)
     seen = dict.fromkeys(session.robot.joint_names if session.robot is not None else ())
     for key in ("command", "position"):
@@ -257,6 +255,24 @@ def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[s
             except MissingChannelError:
                 continue
         return some
+
+
+def _check_robots(session: SessionView, topics: JointTopics) -> None:
+    """Raise DataError if it isn't known which of several robots is meant."""
+    if topics.robots:
+        choices = (f"--command-topic {one} --response-topic {two}" for one, two in topics.robots)
+        raise DataError(
+            f"{session.path.name}: {len(topics.robots)} robots with joints of the same names; "
+            f"choose one: {', or '.join(choices)}"
+        )
+
+
+def _check_nodes(session: SessionView, found: Mapping[str, JointSignals]) -> None:
+    """Raise DataError if commands or positions come from two nodes."""
+    for key in ("command", "position"):
+        if key in found and are_of_two_nodes(found[key].values):
+            why = f"{in_turn(found[key].topic)}; record one of them alone"
+            raise DataError(f"{session.path.name}: {why}")
 
 
 def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: Warn) -> None:

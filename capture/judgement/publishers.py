@@ -35,6 +35,7 @@ def _in_turn(values: FloatArray) -> bool | None:
     near, next_but_one = (np.median(np.abs(values[k:] - values[:-k])) for k in (1, 2))
     if near < RESPONDS * np.std(values) or next_but_one > COHERENT * near:
         return False
-    even, odd = (part - part.mean() for part in (values[: values.size // 2 * 2 : 2], values[1::2]))
-    mirrored = np.mean(even * odd) < -COHERENT * np.std(even) * np.std(odd)
-    return bool(max(np.std(even), np.std(odd)) > RESPONDS * near and not mirrored)
+    covariance = np.cov(values[: values.size // 2 * 2 : 2], values[1::2])
+    even, odd = (float(power) ** 0.5 for power in np.diagonal(covariance))
+    mirrored = float(covariance[0, 1]) < -COHERENT * even * odd
+    return max(even, odd) > RESPONDS * float(near) and not mirrored
