@@ -25,7 +25,7 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
-from undulog.capture.judgement.exposure import COHERENT
+from undulog.capture.judgement.levels import HALF
 from undulog.capture.judgement.motion import JointMotion, Samples, course_of, cycle_s
 from undulog.capture.judgement.response import Filtered, fit_response
 from undulog.capture.log.read.sample_times import LARGEST, Signal
@@ -378,7 +378,7 @@ def _linear(position: Series, command: Series) -> Series:
         return command
     row = course.command[0], course.position[0], course.present[0], course.step_s
     response = fit_response(*row)
-    if response.explained < COHERENT:
+    if response.explained < HALF:
         return command
     output = Filtered(course.command, course.step_s).output(response)[0]
     return Series(command.name, course.t_s, abs(response.gain) * output)

@@ -13,7 +13,7 @@ from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.judgement.publishers import are_of_two_nodes
-from undulog.capture.judgement.session import MOST_JOINTS, in_turn
+from undulog.capture.judgement.session import in_turn
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.joint_topics import (
     HOW_TO_CHOOSE,
@@ -21,7 +21,7 @@ from undulog.capture.log.read.joint_topics import (
     JointTopics,
 )
 from undulog.capture.log.read.pauses import without_pauses
-from undulog.capture.log.read.sample_times import LARGEST, JointSignals, Signal
+from undulog.capture.log.read.sample_times import LARGEST, MOST_JOINTS, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
 from ..estimators.turning import turning_beside_others

@@ -22,7 +22,6 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, ImportFormatError, MissingChannelError, some_names
 from ..common.files import check_stop
 from ..common.process import StopRequest
-from ..judgement.session import MOST_JOINTS
 from ..log.cut import cut_log
 from ..log.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag
@@ -31,6 +30,7 @@ from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
 from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
 from ..log.read.joint_topics import COMMAND_TOPIC, HOW_TO_CHOOSE, RESPONSE_TOPIC, JointTopics
+from ..log.read.sample_times import MOST_JOINTS
 from ..log.read.session import Session
 from ..log.write.channels import JointStateChannel
 from ..log.write.writer import SessionWriter

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .exposure import ENOUGH_LIKE, LIKE_LAG_S, RESPONDS, Exposure, responds
+from .exposure import LIKE_LAG_S, Exposure, responds
 from .fault import Apart
+from .levels import ENOUGH_LIKE, QUARTER
 
 
 def find_apart(exposure: Exposure, names: Sequence[str], left_out: Sequence[bool]) -> list[Apart]:
@@ -48,7 +49,7 @@ def find_apart(exposure: Exposure, names: Sequence[str], left_out: Sequence[bool
                 others = np.delete(others, np.argmax(np.abs(others - middle)))
             low, high = float(others.min()), float(others.max())
             away = max(value - high, low - value)
-            margin = RESPONDS * middle
+            margin = QUARTER * middle
             margin = max(margin, LIKE_LAG_S) if quantity == "lag" else margin
             if away > max(2 * (high - low), margin):
                 found.append(Apart(names[k], quantity, value, (low, high)))

@@ -11,14 +11,18 @@ import numpy as np
 from scipy.special import bdtrc
 
 from ..common.arrays import BoolArray, FloatArray
-from .exposure import COHERENT, ENOUGH_LIKE, LARGEST_REST_RAD, Exposure
+from .exposure import Exposure
+from .levels import (
+    ENOUGH_LIKE,
+    FEWEST,
+    HALF,
+    LARGEST_REST_RAD,
+    NEGLIGIBLE,
+    RARE,
+    ROBUST,
+    TAME,
+)
 from .motion import Course, cycle_s
-from .record import RARE
-from .shifts import FEWEST, ROBUST, TAME
-
-FEW = 0.003
-"""Share of far samples that any joint may have: lost packets that a driver fills, a few in a
-thousand."""
 
 
 def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[int, float]:
@@ -44,7 +48,7 @@ def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[i
         others = [j for j in exposure.group(k) if j != k and count[j]]
         if len(others) < ENOUGH_LIKE - 1:
             continue
-        usual = min(FEW + 2 * float(np.median(share[others])), 1.0)
+        usual = min(NEGLIGIBLE + 2 * float(np.median(share[others])), 1.0)
         if far[k] and bdtrc(far[k] - 1, count[k], usual) < RARE:
             found[k] = float(share[k])
     return found
@@ -55,8 +59,8 @@ def _far(residual: FloatArray) -> int:
         return 0
     residual = residual - np.median(residual)
     away = np.abs(residual)
-    far = np.flatnonzero(away > max(float(LARGEST_REST_RAD), 2 * TAME * ROBUST * np.median(away)))
+    far = np.flatnonzero(away > max(LARGEST_REST_RAD, 2 * TAME * ROBUST * np.median(away)))
     inner = far[far < residual.size - 1]
     power = float(residual[inner] @ residual[inner])
     # A joint that vibrates is where it was a sample before; noise is not.
-    return 0 if float(residual[inner] @ residual[inner + 1]) > COHERENT * power else far.size
+    return 0 if float(residual[inner] @ residual[inner + 1]) > HALF * power else far.size

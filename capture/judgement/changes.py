@@ -15,12 +15,23 @@ from math import inf
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from .exposure import ENOUGH_LIKE, LIKE_LAG_S, RESPONDS, Exposure
-from .motion import Course, cycle_s, is_sweep
-from .shifts import (
+from .exposure import LIKE_LAG_S, Exposure
+from .levels import (
+    ANGLE_MARGIN_RAD,
+    ENOUGH_LIKE,
     FEWEST,
+    FULL,
+    GAIN_MARGIN,
+    NEGLIGIBLE,
+    QUARTER,
+    REST_ERRORS,
     ROBUST,
     TAME,
+    TINY,
+    WIDTH,
+)
+from .motion import Course, cycle_s, is_sweep
+from .shifts import (
     Shift,
     correlation_of,
     drift_of,
@@ -28,24 +39,25 @@ from .shifts import (
     limited_weights,
     without_single,
 )
-from .stillness import FULL
 
-MOST = 64
+MOST = FEWEST * FEWEST
 """Blocks that a course is divided into at most: onsets to 1.6 % of the record."""
 
-GAIN_MARGIN = 0.02
-"""Relative gain that matters: the margin of "alike"."""
+SHORTEST_S = 2.0
+"""Time on either side of a change, at least [s]; also so many blocks: one alone may hold a step of
+the command that no response fits."""
 
-ANGLE_MARGIN_RAD = np.radians(1.0)
-"""Angle that matters [rad]: the margin of "alike"."""
+RIDGE = NEGLIGIBLE * NEGLIGIBLE
+"""Ridge on gain and lag, relative to the median block: less than 0.1 % of them is lost."""
 
-NOISE_MARGIN = np.log(2.0)
+INFORMED = 1 - FULL
+"""Share of the information of the best blocks below which a block is left out."""
+
+NOISE_MARGIN = float(np.log(2.0))
 """Logarithm of the ratio of noise that matters: twice as much."""
 
-WIDTH = 1.96
-"""Standard errors of a 95 % interval."""
-
 QUANTITIES = ("offset", "gain", "lag", "noise")
+TERMS = len(QUANTITIES) - 1  # of the regression
 
 
 @dataclass(frozen=True)
@@ -86,8 +98,8 @@ class _Blocks:
     def shortest(self) -> int:
         """Blocks of a change, at least."""
         block_s = float(self.edges_s[1] - self.edges_s[0])
-        least_s = max(HALF_CYCLES * self.half_s, SHORTEST_S)
-        return max(SHORTEST, int(np.ceil(least_s / block_s - 1e-6)))
+        least_s = max(2 * REST_ERRORS * self.half_s, SHORTEST_S)
+        return max(int(SHORTEST_S), int(np.ceil(least_s / block_s - NEGLIGIBLE)))
 
 
 def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
@@ -154,24 +166,24 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
-        return not alone and _reaches(run, float(NOISE_MARGIN))
+        return not alone and _reaches(run, NOISE_MARGIN)
     lost = float(blocks.lost_rad[k]) if alone else 0.0
     if quantity in ("offset", "drift"):
-        return _reaches(run, float(ANGLE_MARGIN_RAD)) and abs(run.change) > lost
+        return _reaches(run, ANGLE_MARGIN_RAD) and abs(run.change) > lost
     inside = slice(run.first, run.last)
     _, motion, rate, count = blocks.weights[:, k]
     lasting = run.first == 0 or run.last == count.size
     if blocks.swept[k]:  # another time is another frequency, to which each joint responds
-        least = RESPONDS if quantity == "gain" else LIKE_LAG_S
+        least = QUARTER if quantity == "gain" else LIKE_LAG_S
         if not (compared and lasting and abs(run.change) > least):
             return False
     samples = max(float(count[inside].sum()), 1.0)
-    amplitude = max((2 * float(motion[inside].sum()) / samples) ** 0.5, 1e-9)
+    amplitude = max(np.sqrt(2 * float(motion[inside].sum()) / samples), TINY)
     if quantity == "gain":
         return _reaches(run, GAIN_MARGIN) and abs(run.change) > lost / amplitude
-    speed = max((2 * float(rate[inside].sum()) / samples) ** 0.5, 1e-9)
+    speed = max(np.sqrt(2 * float(rate[inside].sum()) / samples), TINY)
     # One degree of a cycle; without one, as an angle of the wave of that amplitude and rate.
-    margin = float(ANGLE_MARGIN_RAD) * (blocks.half_s / np.pi or amplitude / speed)
+    margin = ANGLE_MARGIN_RAD * (blocks.half_s / np.pi or amplitude / speed)
     return _reaches(run, margin) and abs(run.change) > lost / speed
 
 
@@ -203,13 +215,18 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         level = float(exposure.fitted[k] @ there) / max(float(there.sum()), 1.0)
         residual, scatter = _tamed(residual, there, count, width)
         rows = np.stack([np.ones_like(rate), exposure.fitted[k] - level, -rate, residual])
-        values[:3, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
-        lost[k] = 3 * float(np.median(scatter[weights[3, k] > 0])) if weights[3, k].any() else 0.0
+        values[:TERMS, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
+        lost[k] = REST_ERRORS * _middle(scatter[weights[TERMS, k] > 0])
         # Below the usual noise no change is of interest.
-        values[3, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2 + 1e-12))
+        values[TERMS, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2) + TINY)
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
     swept = tuple(is_sweep(command) for command in course.command)
     return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
+
+
+def _middle(values: FloatArray) -> float:
+    """Return the median; 0 of none."""
+    return float(np.median(values)) if values.size else 0.0
 
 
 def _tamed(
@@ -234,41 +251,27 @@ def _tamed(
 def _regressed(
     weighted: FloatArray, rows: FloatArray, starts: IntArray, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return offset, gain and lag of each block, shape (3, b), and weights, shape (q, b)."""
+    """Return offset, gain and lag of each block, shape (q - 1, b), and weights, shape (q, b)."""
     stop = int(starts[-1]) + width
     products = weighted[:, None, :stop] * rows[None, :, :stop]
     moments = np.moveaxis(np.add.reduceat(products, starts, axis=2), 2, 0)
-    gram, target = moments[:, :3, :3], moments[:, :3, 3]
+    gram, target = moments[:, :TERMS, :TERMS], moments[:, :TERMS, TERMS]
     count = gram[:, 0, 0]
     typical = np.median(np.diagonal(gram, axis1=1, axis2=2), axis=0)
     scale = np.sqrt(np.where(typical > 0, typical, 1.0))
     scaled = gram / scale[:, None] / scale[None, :]
     # A block without motion knows its offset only: the ridge keeps the rest at 0, weightless.
-    ridge = np.diag([0.0, RIDGE, RIDGE])
-    inverse = np.linalg.inv(scaled + ridge + 1e-9 * np.eye(3)) / np.outer(scale, scale)
+    ridge = np.full(TERMS, RIDGE)
+    ridge[0] = np.finfo(np.float64).eps
+    inverse = np.linalg.inv(scaled + np.diag(ridge))
+    inverse /= scale[:, None] * scale[None, :]
     estimate = np.einsum("bij,bj->bi", inverse, target)
     weights = np.concatenate(
-        [1 / np.maximum(np.diagonal(inverse, axis1=1, axis2=2).T, 1e-300), [count]]
+        [1 / np.maximum(np.diagonal(inverse, axis1=1, axis2=2).T, TINY), [count]]
     )
     weights[:, count < FULL * width] = 0
     weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
     return estimate.T, weights
-
-
-HALF_CYCLES = 6
-"""Half cycles on either side of a change, at least: three cycles."""
-
-SHORTEST_S = 2.0
-"""Time on either side of a change, at least [s]."""
-
-SHORTEST = 2
-"""Blocks of a change, at least: one alone may hold a step of the command that no response fits."""
-
-RIDGE = 1e-3
-"""Ridge on gain and lag, relative to the median block: 0.1 % of what is known of them is lost."""
-
-INFORMED = 0.1
-"""Share of the information of the best blocks below which a block is left out."""
 
 
 def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray) -> float:

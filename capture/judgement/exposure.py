@@ -15,25 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
+from .levels import (
+    COVERAGE,
+    ENOUGH_LIKE,
+    HALF,
+    LARGEST_REST_RAD,
+    QUARTER,
+    REST_ERRORS,
+    WHOLE,
+)
 from .motion import Course, JointMotion
 from .response import SETTLED, Filtered, Response
-
-REST_ERRORS = 3
-"""Rest errors beyond which a motion is asked for: one at either end is lost in a dead band, and one
-is noise."""
-
-LARGEST_REST_RAD = np.radians(3.0)
-"""Largest rest error without a description [rad]: play and steps of hobby servos are below."""
-
-ENOUGH_LIKE = 4
-"""Joints that a common response needs, so that one faulty joint doesn't move their median."""
-
-RESPONDS = 1 / 4
-"""Gain from which a joint responds: play within the rest error leaves a third of the least motion
-that is judged."""
-
-COHERENT = 1 / 2
-"""Explained share from which a response is one: with less, most of the motion is something else."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +89,8 @@ def exposure_of(
         offset = response.offset_rad
         healthy[k] = offset + common.gain * filtered[k].output(common)[0]
         pool = group if len(group) >= ENOUGH_LIKE else others
-        pooled = float(np.median(lost[pool])) if pool else float(LARGEST_REST_RAD)
-        rest[k] = min(pooled, float(LARGEST_REST_RAD))
+        pooled = float(np.median(lost[pool])) if pool else LARGEST_REST_RAD
+        rest[k] = min(pooled, LARGEST_REST_RAD)
         known = sound or [r for r in responses if responds(r)]
         settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
     own = np.minimum(lost, LARGEST_REST_RAD)
@@ -112,15 +104,15 @@ def _usual_gain(others: Sequence[Response]) -> float:
 
     The joints of a body too heavy for its motors follow by less, and none of them is at fault.
     """
-    gains = [response.gain for response in others if response.explained >= COHERENT]
+    gains = [response.gain for response in others if response.explained >= HALF]
     if len(gains) < ENOUGH_LIKE - 1:
         return 1.0
-    return min(1.0, max(float(np.median(gains)), RESPONDS))
+    return min(1.0, max(float(np.median(gains)), QUARTER))
 
 
 def responds(response: Response) -> bool:
     """Return whether a joint responds to its command, the right way round."""
-    return response.gain >= RESPONDS and response.explained >= COHERENT
+    return response.gain >= QUARTER and response.explained >= HALF
 
 
 def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tuple[int, ...]:
@@ -130,19 +122,19 @@ def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tupl
         names = list(dict.fromkeys(kinds))
         return tuple(names.index(kind) for kind in kinds)
     sound = [response for response in responses if responds(response)]
-    if len(sound) < ENOUGH_LIKE or 3 * len(sound) < 2 * len(responses):
+    if len(sound) < ENOUGH_LIKE or len(sound) < WHOLE * len(responses):
         return tuple(range(len(motions)))
     common = median_response(sound)
     agree = [agrees(response, common) for response in responses]
-    if sum(agree) < max(ENOUGH_LIKE, 2 * len(responses) / 3):
+    if sum(agree) < max(ENOUGH_LIKE, WHOLE * len(responses)):
         return tuple(range(len(motions)))
     return (0,) * len(motions)
 
 
 def agrees(response: Response, common: Response) -> bool:
     """Return whether a response is a common one, up to a profile along the body."""
-    return abs(response.gain / common.gain - 1) < RESPONDS and (
-        abs(response.lag_s - common.lag_s) < max(RESPONDS * common.lag_s, LIKE_LAG_S)
+    return abs(response.gain / common.gain - 1) < QUARTER and (
+        abs(response.lag_s - common.lag_s) < max(QUARTER * common.lag_s, LIKE_LAG_S)
     )
 
 
@@ -163,7 +155,7 @@ def _lost_motion(residual: FloatArray) -> float:
     """Return half the width that holds 95 % of a residual: two standard deviations of noise."""
     if residual.size == 0:
         return 0.0
-    low, high = np.quantile(residual, (0.025, 0.975))
+    low, high = np.quantile(residual, ((1 - COVERAGE) / 2, (1 + COVERAGE) / 2))
     return float(high - low) / 2
 
 

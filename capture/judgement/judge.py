@@ -17,19 +17,22 @@ from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
 from .apart import find_apart
 from .bursts import find_bursts
-from .changes import SHORTEST_S, WIDTH, Jump, find_jumps
-from .exposure import (
-    COHERENT,
-    LARGEST_REST_RAD,
-    RESPONDS,
-    REST_ERRORS,
-    Exposure,
-    agrees,
-    exposure_of,
-    median_response,
-    responds,
-)
+from .changes import SHORTEST_S, Jump, find_jumps
+from .exposure import Exposure, agrees, exposure_of, median_response, responds
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
+from .levels import (
+    ANGLE_MARGIN_RAD,
+    FEWEST,
+    FOLLOWS,
+    FULL,
+    HALF,
+    LARGEST_REST_RAD,
+    QUARTER,
+    REST_ERRORS,
+    TINY,
+    WHOLE,
+    WIDTH,
+)
 from .lines import find_lines
 from .motion import Course, JointMotion, course_of, cycle_s, rises_of, runs_of
 from .naming import Kind, Verdict, in_words, permutation_of
@@ -39,24 +42,14 @@ from .rests import find_rests
 from .standing import opposite_kinds, standing_kinds
 from .stillness import Stillness, stillness_of, usable_steps
 
-WHOLE = 2 / 3
-"""Share of its exposed time from which a fault holds throughout: what the trimmed response can't
-have left out."""
-
-UNIT_SLACK = 1.6
+UNIT_SLACK = 2.0
 """Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it."""
 
-ORDERLY = 0.8
-"""Explained share of the other joints beside which one that follows nothing stands out."""
+LEAST_RANGE_RAD = (1 - FULL) * ANGLE_MARGIN_RAD
+"""A command that moves less is held still [rad]: a step of a 12-bit encoder is 0.09 degrees."""
 
 MOVING = frozenset({"swapped", "inverted", "inverted_sensor", "noisy_sensor"})
 """Kinds of a joint that moves, though not as commanded."""
-
-RESOLVED = 8
-"""Samples of a cycle, at least: linear interpolation between them errs by 1 - cos(pi/8) = 8 %."""
-
-LEAST_RANGE_RAD = 1e-3
-"""A command that moves less is held still [rad]: a step of a 12-bit encoder is 1.5e-3."""
 
 
 def judge(motions: Sequence[JointMotion]) -> Judgement:
@@ -140,7 +133,7 @@ def _too_seldom(course: Course) -> bool:
     power = np.maximum(np.sum(now**2, axis=1), np.finfo(np.float64).tiny)
     cosine = np.sum(now * middle, axis=1) / power
     left, size = np.median(np.abs([middle - cosine[:, None] * now, now]), axis=2)
-    seldom = (left < COHERENT * size) & (cosine < np.cos(2 * np.pi / RESOLVED))
+    seldom = (left < HALF * size) & (cosine < np.cos(2 * np.pi / FEWEST))
     return bool(2 * np.count_nonzero(seldom) > seldom.size)
 
 
@@ -164,7 +157,7 @@ def _late_or_opposite(course: Course, exposure: Exposure) -> str:
     lags: list[float] = []
     for command, response in zip(course.command, exposure.responses, strict=True):
         half = cycle_s(command, course.step_s) / 2
-        if response.gain < 0 and response.explained >= ORDERLY:
+        if response.gain < 0 and response.explained >= FOLLOWS:
             lags.append(half + response.lag_s)
     if len(lags) <= WHOLE * len(exposure.responses) or np.median(lags) > 2 * LATEST_S:
         return ""
@@ -216,11 +209,11 @@ def _faults(
             text = _stood(spans, course, k, exposure)
             text = f"{text}; {why}" if why else text
             faults[motion.name] = _fault(motion, kinds, spans, share, text)
-        elif _is_incoherent(course, exposure, k) and np.median(others) > ORDERLY:
+        elif _is_incoherent(course, exposure, k) and np.median(others) > FOLLOWS:
             text = f"its command explains {100 * response.explained:.0f} % of its motion"
-            low, high = np.quantile(course.position[k], (1 - ORDERLY, ORDERLY))
+            low, high = np.quantile(course.position[k], (1 - FOLLOWS, FOLLOWS))
             kinds, why = ("noisy_sensor", "dead"), ""
-            if high - low < RESPONDS * float(np.ptp(exposure.healthy[k])):
+            if high - low < QUARTER * float(np.ptp(exposure.healthy[k])):
                 whole = (float(course.t_s[0]), float(course.t_s[-1]))
                 kinds, why = standing_kinds(motion, [whole], like)
             faults[motion.name] = _whole(motion, kinds, f"{text}; {why}" if why else text)
@@ -267,17 +260,17 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
 
     Over such times a zero that moved is a single step.
     """
-    if exposure.responses[k].explained >= COHERENT:
+    if exposure.responses[k].explained >= HALF:
         return False
     steps = max(1, int(exposure.settling_s[k] / course.step_s))
     moved, asked = (
         values[k, steps:] - values[k, :-steps] for values in (course.position, exposure.healthy)
     )
-    limit = np.quantile(np.abs(moved), ORDERLY)
+    limit = np.quantile(np.abs(moved), FOLLOWS)
     inside = np.abs(moved) <= max(float(limit), float(np.ptp(exposure.healthy[k])))
     power = float(np.std(moved[inside]) * np.std(asked[inside]))
     covariance = float(np.cov(moved[inside], asked[inside])[0, 1])
-    return power == 0 or abs(covariance) < COHERENT * power
+    return power == 0 or abs(covariance) < HALF * power
 
 
 def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
@@ -286,7 +279,7 @@ def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
     Of a cycle or two, a fit alone can't tell a sign from a delay.
     """
     response = exposure.responses[k]
-    if response.gain > -RESPONDS or response.explained < COHERENT:
+    if response.gain > -QUARTER or response.explained < HALF:
         return False
     if rises_of(course.command[k]).size > 2:
         return True
@@ -304,13 +297,13 @@ def _leader(course: Course, exposure: Exposure, k: int) -> int | None:
     best = int(np.argmin(left))
     opposite = float(np.var(position + healthy[k]))
     rival = min(float(left[k]), opposite)
-    if best == k or left[best] > (1 - ORDERLY) * float(np.var(position)):
+    if best == k or left[best] > (1 - FOLLOWS) * float(np.var(position)):
         return None
     if responds(exposure.responses[k]):  # a lag or a gain of its own explains as much
         rival = min(rival, float(np.var(course.position[k] - exposure.fitted[k])))
     if rival < exposure.least_rad[k] ** 2:  # what a healthy joint may lose
         return None
-    return best if left[best] < RESPONDS * rival else None
+    return best if left[best] < QUARTER * rival else None
 
 
 def _common_stands(stillness: Stillness) -> BoolArray:
@@ -333,7 +326,7 @@ def _alone(stands: BoolArray, common: BoolArray) -> BoolArray:
 def _gain_is(exposure: Exposure, k: int, factor: float) -> bool:
     """Return whether a joint's gain is a factor between units, up to what a servo's gain may be."""
     response = exposure.responses[k]
-    if response.explained < COHERENT or response.gain <= 0:
+    if response.explained < HALF or response.gain <= 0:
         return False
     return abs(float(np.log(response.gain / factor))) < np.log(UNIT_SLACK)
 
@@ -391,13 +384,13 @@ def _ends(course: Course, exposure: Exposure, jump: Jump) -> bool:
     Its motion is what goes with the healthy one or with its rate; the rest is noise.
     """
     k, inside = jump.joint, (course.t_s > jump.first_s + jump.block_s) & (course.t_s < jump.last_s)
-    if jump.quantity != "gain" or jump.change > RESPONDS - 1 or not inside.any():
+    if jump.quantity != "gain" or jump.change > QUARTER - 1 or not inside.any():
         return False
     healthy = exposure.healthy[k]
     asked = np.stack([healthy, np.gradient(healthy, course.step_s)])[:, inside]
     design: FloatArray = (asked - asked.mean(axis=1, keepdims=True)).T
     factors = np.asarray(np.linalg.lstsq(design, course.position[k, inside])[0], dtype=np.float64)
-    return bool(np.std(design @ factors) < RESPONDS * np.std(healthy[inside]))
+    return bool(np.std(design @ factors) < QUARTER * np.std(healthy[inside]))
 
 
 def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Fault:
@@ -407,7 +400,7 @@ def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Faul
     kinds, why = standing_kinds(motion, [span], like)
     text = f"moves {100 * -jump.change:.0f} % less than before"
     until = jump.last_s if isfinite(jump.last_s) else None
-    share = (span[1] - span[0]) / max(end - float(motion.position.t_s[0]), 1e-9)
+    share = (span[1] - span[0]) / max(end - float(motion.position.t_s[0]), TINY)
     evidence = f"{text}; {why}" if why else text
     return Fault(motion.name, kinds, (span,), span[0], until, min(share, 1.0), evidence)
 

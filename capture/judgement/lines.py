@@ -18,12 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
-from .changes import ANGLE_MARGIN_RAD, WIDTH
-from .exposure import REST_ERRORS, Exposure
+from .exposure import Exposure
+from .levels import ANGLE_MARGIN_RAD, FEWEST, LEVEL, REST_ERRORS, TINY, WIDTH
 from .motion import Course, cycle_s
-from .shifts import LEVEL
 
-TAPERS = 8
+TAPERS = FEWEST
 """Sine tapers: 14 degrees of freedom of the noise, with lines resolved to 8 cycles a record."""
 
 NEIGHBOURS = 2
@@ -62,7 +61,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     frequency = np.asarray(np.fft.rfftfreq(padded, course.step_s), dtype=np.float64)
     residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
-    amplitude, error, tail = np.empty((3, count, frequency.size))
+    amplitude, error, tail = np.empty((1 + 2, count, frequency.size))
     for k in range(count):
         amplitude[k], error[k], tail[k] = _tested(residual[k], padded)
     tests = count * size
@@ -90,7 +89,7 @@ def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int
     motion: FloatArray = exposure.fitted[k]
     motion = motion - motion.mean()
     rate = np.gradient(motion, course.step_s)
-    slow = float(np.linalg.norm(rate)) / max(2 * np.pi * float(np.linalg.norm(motion)), 1e-300)
+    slow = float(np.linalg.norm(rate)) / max(2 * np.pi * float(np.linalg.norm(motion)), TINY)
     rest = REST_ERRORS * exposure.rest_rad[k] if len(exposure.group(k)) == 1 else 0.0
     least = np.where(frequency <= HARMONICS * slow, rest, 0.0)
     return np.maximum(least, ANGLE_MARGIN_RAD)
@@ -121,16 +120,16 @@ def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray, 
     weighted = np.zeros(padded // 2 + 1, dtype=np.complex128)
     sums = 0.0
     for k in range(1, TAPERS + 1):
-        taper = (2 / (size + 1)) ** 0.5 * np.sin(np.pi * k * steps / (size + 1))
+        taper = np.sqrt(2 / (size + 1)) * np.sin(np.pi * k * steps / (size + 1))
         transformed: ComplexArray = np.fft.rfft(taper * residual, padded)
         total = float(taper.sum())
         weighted += total * transformed
         power += np.abs(transformed) ** 2
         sums += total**2
     projected = np.abs(weighted) ** 2 / sums
-    left = np.maximum(power - projected, 1e-300)
+    left = np.maximum(power - projected, TINY)
     statistic = (TAPERS - 1) * projected / left
     tail = (1 + statistic / (TAPERS - 1)) ** -(TAPERS - 1)
     amplitude = 2 * np.abs(weighted) / sums
-    error = amplitude / np.sqrt(np.maximum(statistic, 1e-300))
+    error = amplitude / np.sqrt(np.maximum(statistic, TINY))
     return amplitude, error, np.asarray(tail, dtype=np.float64)

@@ -8,27 +8,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
+from .levels import ANGLE_MARGIN_RAD, COVERAGE, FULL, MISSING, WHOLE
 from .shifts import rank_correlation
 
 LARGEST_COURSE = 1 << 16
 """Steps of a course at most: an hour at 18 Hz, ten samples a cycle of the fastest gaits. Memory and
 time of the judgement of 25 joints stay below 0.1 GB and some seconds."""
 
-ALTERNATE = 1.5
-"""Steps without a sample from which a course has none there: with less, rounding decides."""
-
 ALIKE = 2
 """Ratio of long to short cycles (90 and 10 %) of a rhythm at most: a gait that changes its pace by
 more is several gaits."""
-
-SWEPT = 0.9
-"""Rank correlation of a cycle's length with its number from which a command is a sweep."""
-
-HYSTERESIS = 10
-"""Share of the range about its middle that is no crossing, inverse: noise is less than that."""
-
-LEAST_ASKED_RAD = np.radians(0.5)
-"""Motion of most commands in a pause [rad]: half of the margin of "alike"; less shows nowhere."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +133,7 @@ def _present(motion: JointMotion, t_s: FloatArray, step_s: float) -> BoolArray:
     """Mark the steps with a sample nearby, within the time in which the joint was commanded."""
     samples = motion.position.t_s
     following = np.searchsorted(samples, t_s).clip(1, samples.size - 1)
-    near = ALTERNATE * max(step_s, motion.position.period_s)
+    near = MISSING * max(step_s, motion.position.period_s)
     before, after = np.abs(t_s - samples[following - 1]), np.abs(samples[following] - t_s)
     close = np.minimum(before, after) <= near
     commanded = (t_s >= motion.command.t_s[0]) & (t_s <= motion.command.t_s[-1] + near)
@@ -163,9 +152,9 @@ def _paused(command: FloatArray, position: FloatArray) -> BoolArray:
     repeats = np.all(np.diff(position, prepend=np.nan) == 0, axis=0)
     for first, last in runs_of(repeats):
         asked = np.ptp(command[:, first - 1 : last], axis=1)
-        if np.median(asked) > LEAST_ASKED_RAD:
+        if np.median(asked) > ANGLE_MARGIN_RAD / 2:
             paused[first:last] = True
-    return paused if 3 * np.count_nonzero(paused) < paused.size else np.zeros_like(paused)
+    return paused if np.mean(paused) < 1 - WHOLE else np.zeros_like(paused)
 
 
 def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
@@ -177,7 +166,7 @@ def runs_of(marked: BoolArray) -> list[tuple[int, int]]:
 def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:
     """Mark the steps that are in no gap between two commands."""
     intervals = np.diff(command_s)
-    gaps = np.flatnonzero(intervals > 2 * ALTERNATE * float(np.quantile(intervals, 0.95)))
+    gaps = np.flatnonzero(intervals > 2 * MISSING * float(np.quantile(intervals, COVERAGE)))
     known = np.ones(t_s.size, dtype=np.bool_)
     for gap in gaps.tolist():
         known &= (t_s <= command_s[gap]) | (t_s >= command_s[gap + 1])
@@ -187,7 +176,7 @@ def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:
 def rises_of(command: FloatArray) -> IntArray:
     """Return the steps at which a command of shape (n,) rises through its middle."""
     low, high = float(command.min()), float(command.max())
-    away = np.abs(command - (low + high) / 2) > (high - low) / HYSTERESIS
+    away = np.abs(command - (low + high) / 2) > (1 - FULL) * (high - low)
     above = command[away] > (low + high) / 2
     return np.flatnonzero(away).astype(np.int64)[1:][above[1:] & ~above[:-1]]
 
@@ -203,16 +192,16 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
         where the cycles are not alike, as in a chirp.
     """
     rises = rises_of(command)
-    if rises.size < 3:
+    if rises.size <= 2:
         return float("inf")
     lengths = np.diff(rises)
-    short, long = np.quantile(lengths, (0.1, 0.9))
+    short, long = np.quantile(lengths, (1 - FULL, FULL))
     return float(np.median(lengths)) * step_s if long <= ALIKE * short else float("inf")
 
 
 def is_sweep(command: FloatArray) -> bool:
     """Return whether the cycles of a command of shape (n,) get shorter, or longer, all along."""
     lengths = np.diff(rises_of(command))
-    if lengths.size < 3 or lengths.min() == lengths.max():
+    if lengths.size <= 2 or lengths.min() == lengths.max():
         return False
-    return abs(rank_correlation(lengths)) > SWEPT
+    return abs(rank_correlation(lengths)) > FULL

@@ -36,53 +36,55 @@ from scipy.optimize import linear_sum_assignment
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..common.errors import DataError, some_names
+from .levels import (
+    ENOUGH_LIKE,
+    FOLLOWS,
+    GAIN_MARGIN,
+    HALF,
+    NEGLIGIBLE,
+    QUARTER,
+    WHOLE,
+)
 from .response import LATEST_S
 
-MOVES = 0.01
+MOVES = NEGLIGIBLE
 """A joint whose standard deviation is below this share of the largest stands still: the share by
 which the analysis tells driven joints (``DRIVEN_SHARE``)."""
-
-DELAYS = 33
-"""Delays that are tried in half a period: 5.6 degrees of phase apart, so that the nearest
-is within 2.8 degrees, which costs sin^2 = 0.24 % of the explained share."""
 
 PER_PERIOD = 16
 """Samples a period that are looked at, at least; finer records are thinned out. Any number above
 the two of the sampling theorem will do: 16 leave room for what is faster than the median."""
 
+DELAYS = 2 * PER_PERIOD + 1
+"""Delays that are tried in half a period: 5.6 degrees of phase apart, so that the nearest
+is within 2.8 degrees, which costs sin^2 = 0.24 % of the explained share."""
+
 LEAST_PERIODS = 2.0
 """Periods that a record must have: over less than two, any two smooth motions are alike."""
 
-FOLLOWS = 0.8
-"""Explained share from which a joint follows: that of a gait (``MIN_EXPLAINED``). A phase error of
-27 degrees or a gain of 0.69 to 1.8 times the common one leaves as much."""
 
-DECIDES = 0.2
+DECIDES = 1 - FOLLOWS
 """Loss of explained share by which one joint decides between two explanations: that from all of it
-to :data:`FOLLOWS`."""
+to :data:`.levels.FOLLOWS`."""
 
-AS_GOOD = 0.02
+AS_GOOD = GAIN_MARGIN
 """Mean loss up to which two explanations are alike, and the favour that names have over any other
 order: 8 degrees of phase or 12 % of gain, by which healthy joints of one kind may differ."""
 
-SUGGESTS = 0.05
+SUGGESTS = 2 * AS_GOOD
 """Mean loss of the joints that a permutation moves from which it is stated beside what else they
-may be: 13 degrees of phase, more than healthy joints of one kind differ by."""
+may be."""
 
-ENOUGH = 2 / 3
-"""Share of the moved joints that a permutation must explain; a third may have faults besides."""
-
-
-TELLING = 0.25
+TELLING = QUARTER
 """Share of the joints moved by an order that is no shift and no reversal which must tell it from
 the names: whole waves of close joints can be moved up by a little to explain one that is late."""
 
-NAMED = 4
-"""Joints that a clause names at most, as a sentence of the answer does."""
-
-MOST_PAIRED = 4
+MOST_PAIRED = ENOUGH_LIKE
 """Joints of which each two are tried as swapped, where so many tell a permutation from the names:
 two would do, and two more may be disturbed."""
+
+NAMED = 4
+"""Joints that a clause names at most, as a sentence of the answer does."""
 
 
 class Verdict(StrEnum):
@@ -167,7 +169,7 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
     alike = _interchangeable(commands)
     named, *others = _candidates(pairs)
     best = _simplest(pairs, named, others)
-    if np.count_nonzero(best.explained >= FOLLOWS) < 0.5 * np.count_nonzero(pairs.judged):
+    if np.count_nonzero(best.explained >= FOLLOWS) < HALF * np.count_nonzero(pairs.judged):
         return Naming(Verdict.UNKNOWN, interchangeable=alike)
     turned = _inverted(pairs, named, range(pairs.judged.size))
     if turned.delay_s <= best.delay_s and _as_good(turned, best):
@@ -192,7 +194,7 @@ def _permuted(
     moved = np.array(best.moved)
     follow = moved[best.explained[moved] >= FOLLOWS]
     fits = Naming(Verdict.FITS, (named,), (), alike)
-    if follow.size < max(2, ENOUGH * moved.size) or np.any(loss <= -DECIDES):
+    if follow.size < max(2, WHOLE * moved.size) or np.any(loss <= -DECIDES):
         return fits
     decided_by = _deciding(best, named)
     regular = _shifts(pairs)
@@ -200,7 +202,7 @@ def _permuted(
     # One joint of another lag can be had by moving many that are next to each other in phase.
     gained = best.explained - np.diagonal(pairs.explained[pairs.delay_s == best.delay_s][0])
     few = decided_by and len(decided_by) < max(2, TELLING * moved.size)
-    if not along and (few or np.mean(gained[moved] > AS_GOOD) < ENOUGH):
+    if not along and (few or np.mean(gained[moved] > AS_GOOD) < WHOLE):
         return fits
     rivals = [one for one in regular if _as_good(one, best)]
     rivals = [one for one in rivals if one.permutation != best.permutation]
@@ -313,7 +315,7 @@ def _check(commands: FloatArray, positions: FloatArray, step_s: float) -> None:
 def _explained_pairs(commands: FloatArray, positions: FloatArray, step_s: float) -> _Pairs | None:
     """Return what each command explains of each joint; None where too little moves."""
     count, joints = commands.shape
-    if joints < 2 or count < 4 * PER_PERIOD:
+    if joints < 2 or count < 2 * LEAST_PERIODS * PER_PERIOD:
         return None
     asked, given = _moving(commands), _moving(positions)
     period_s = _median_period_s(commands, step_s)
@@ -371,7 +373,7 @@ def _median_period_s(commands: FloatArray, step_s: float) -> float:
     taper: FloatArray = np.hanning(count)[:, None]
     centred: FloatArray = commands - commands.mean(axis=0)
     power: FloatArray = np.sum(np.abs(np.fft.rfft(taper * centred, axis=0)) ** 2, axis=1)
-    half = int(np.count_nonzero(np.cumsum(power) < 0.5 * power.sum()))
+    half = int(np.count_nonzero(np.cumsum(power) < power.sum() / 2))
     return count * step_s / max(half, 1)
 
 

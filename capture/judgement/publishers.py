@@ -13,8 +13,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..common.arrays import FloatArray
-from .exposure import COHERENT, RESPONDS
-from .shifts import FEWEST
+from .levels import ANGLE_MARGIN_RAD, FEWEST, HALF, QUARTER
 
 
 def are_of_two_nodes(series: Iterable[FloatArray]) -> bool:
@@ -30,12 +29,12 @@ def are_of_two_nodes(series: Iterable[FloatArray]) -> bool:
 
 def _in_turn(values: FloatArray) -> bool | None:
     """Return whether neighbours are further apart than every other one; None without motion."""
-    if values.size < 2 * FEWEST or np.ptp(values) < np.radians(1.0):
+    if values.size < 2 * FEWEST or np.ptp(values) < ANGLE_MARGIN_RAD:
         return None
     near, next_but_one = (np.median(np.abs(values[k:] - values[:-k])) for k in (1, 2))
-    if near < RESPONDS * np.std(values) or next_but_one > COHERENT * near:
+    if near < QUARTER * np.std(values) or next_but_one > HALF * near:
         return False
     covariance = np.cov(values[: values.size // 2 * 2 : 2], values[1::2])
-    even, odd = (float(power) ** 0.5 for power in np.diagonal(covariance))
-    mirrored = float(covariance[0, 1]) < -COHERENT * even * odd
-    return max(even, odd) > RESPONDS * float(near) and not mirrored
+    even, odd = (float(size) for size in np.sqrt(np.diagonal(covariance)))
+    mirrored = float(covariance[0, 1]) < -HALF * even * odd
+    return max(even, odd) > QUARTER * float(near) and not mirrored

@@ -13,39 +13,24 @@ from scipy.special import bdtrc
 from ..common.arrays import FloatArray
 from ..common.process import in_threads
 from .fault import Fault, Span
+from .levels import (
+    COVERAGE,
+    FEWEST,
+    FOLLOWS,
+    FULL,
+    GAIN_MARGIN,
+    NEGLIGIBLE,
+    RARE,
+)
 from .motion import JointMotion
-
-LOST = 0.01
-"""Share of a joint's samples that may be missing beyond what the joints have in common: of a
-thousand intervals a serial bus with retries drops up to ten."""
 
 STALE = 0.15
 """Share of the fast samples that may repeat the one before, beyond what all joints do: a bus that
 is read faster than its servos answer."""
 
-RARE = 1e-6
-"""Chance of so many repeats from which they are old values: one in a million joints."""
 
-LONGEST = 8
-"""Repeats in turn beyond which a joint stands, or its sensor froze."""
-
-GAP = 1.8
-"""Median intervals from which one lacks a sample: jitter of 80 % is none."""
-
-SILENT = 0.02
-"""Share of the record from which a gap is a silence, which is reported with its times."""
-
-MOSTLY = 0.8
-"""Share of what is missing, or of the steps, that a single explanation covers."""
-
-TURNS = (2 * np.pi, 4 * np.pi, np.pi, np.radians(300.0), 360.0, 4096.0, 65536.0)
-"""Turns of counters: of a shaft, of half and double shafts, of a hobby servo, in raw units."""
-
-SAME = 0.1
-"""Relative difference within which steps are turns of one counter."""
-
-WRAP = 5
-"""Times the command's largest step from which a step is no motion."""
+FEW = 1 - FOLLOWS
+"""Share of the samples that may be steps of a counter, and largest step of the command in one."""
 
 
 def record_faults(motions: Sequence[JointMotion]) -> dict[str, Fault]:
@@ -68,7 +53,7 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, Fault]:
         elif bdtrc(repeats - 1, fast, expected) < RARE:
             text = f"{100 * repeats / fast:.2g} % of its fast samples repeat the one before"
             faults[name] = _whole(name, ("stale_sensor", "lost_samples"), text)
-        elif missing > LOST + 2 * usual_lost:
+        elif missing > NEGLIGIBLE + 2 * usual_lost:
             text = f"lacks samples, {100 * missing:.2g} % of its samples missing"
             faults[name] = _whole(name, ("lost_samples",), text, _silences(motion, missing))
     for motion in motions:
@@ -87,7 +72,7 @@ def _lost(motion: JointMotion) -> float:
     """Share of the samples that are missing or not finite."""
     samples = motion.position
     step, usual = np.diff(samples.t_s), samples.period_s
-    gaps = step[step > GAP * usual]
+    gaps = step[step > (1 + FOLLOWS) * usual]  # jitter of 80 % is none
     absent = float(np.sum(np.round(gaps / usual) - 1)) if gaps.size else 0.0
     # A record of one message per servo may end early: what lacks at the ends counts, too.
     if (commanded := motion.command.t_s).size:
@@ -101,8 +86,8 @@ def _silences(motion: JointMotion, missing: float) -> tuple[Span, ...]:
     t_s = motion.position.t_s
     step = np.diff(t_s)
     length = float(t_s[-1] - t_s[0])
-    long = np.flatnonzero(step > SILENT * length)
-    if not long.size or float(step[long].sum()) < MOSTLY * missing * length:
+    long = np.flatnonzero(step > GAIN_MARGIN * length)
+    if not long.size or float(step[long].sum()) < FOLLOWS * missing * length:
         return ()
     return tuple(zip(t_s[long].tolist(), t_s[long + 1].tolist(), strict=True))
 
@@ -112,17 +97,17 @@ def _repeats(motion: JointMotion) -> tuple[int, int]:
     values = motion.position.values
     step = np.abs(np.diff(values))
     moved = step[step > 0]
-    half = LONGEST // 2
-    if moved.size < LONGEST or values.size < 2 * LONGEST:
+    half = FEWEST // 2
+    if moved.size < FEWEST or values.size < 2 * FEWEST:
         return 0, 0
     # Its own motion over a few samples: a joint that stands repeats its values rightly.
-    travel = np.abs(values[LONGEST:] - values[:-LONGEST]) / LONGEST
+    travel = np.abs(values[FEWEST:] - values[:-FEWEST]) / FEWEST
     travel = np.pad(travel, (half, half - 1), mode="edge")
-    fast = travel > np.maximum(2 * moved.min(), np.quantile(travel, 0.95) / 2)
+    fast = travel > np.maximum(2 * moved.min(), np.quantile(travel, COVERAGE) / 2)
     repeated = step == 0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], repeated.astype(np.int8), [0]])))
     for first, stop in edges.reshape(-1, 2).tolist():
-        if stop - first > LONGEST:
+        if stop - first > FEWEST:
             repeated[first:stop] = False
     return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))
 
@@ -130,20 +115,20 @@ def _repeats(motion: JointMotion) -> tuple[int, int]:
 def _wraps(motion: JointMotion) -> str:
     """Describe the steps of a counter that wraps around, if there are such.
 
-    They have one size, that of a known turn, go up and down, and are larger than the command ever
-    moves between two samples and than half of its range.
+    They have one size, within which the joint stays, go up and down, and are larger than the
+    command ever moves between two samples and than half of its range.
     """
     samples = motion.position
     step = np.diff(samples.values)
     asked = np.abs(np.diff(motion.command.at(samples.t_s)))
     largest = float(asked.max()) if asked.size else 0.0
-    large: FloatArray = step[np.abs(step) > max(WRAP * largest, motion.command.range / 2)]
-    if not 2 <= large.size <= step.size / WRAP:
+    large: FloatArray = step[np.abs(step) > max(largest / FEW, motion.command.range / 2)]
+    if not 2 <= large.size <= step.size * FEW:
         return ""
     turn = float(np.median(np.abs(large)))
-    known = min(abs(turn / size - 1) for size in TURNS) < SAME
-    near = np.abs(np.abs(large) / turn - 1) < SAME
+    confined = samples.range < turn / FULL  # a counter stays within one turn
+    near = np.abs(np.abs(large) / turn - 1) < 1 - FULL
     balance = abs(float(np.sum(np.sign(large))))
-    if not known or np.mean(near) < MOSTLY or balance > max(1.0, large.size / WRAP):
+    if not confined or np.mean(near) < FOLLOWS or balance > max(1.0, large.size * FEW):
         return ""
     return f"{large.size} steps of {np.degrees(turn):.0f} degrees"

@@ -18,8 +18,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.fft import next_fast_len
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
+from .levels import FEWEST, HALF, NEGLIGIBLE, QUARTER, TINY, WHOLE
 from .motion import cycle_s
 
 LATEST_S = 0.3
@@ -29,48 +31,35 @@ SLOWEST_S = 0.4
 """Longest time constant [s]: with it a servo has a bandwidth of 0.4 Hz; slower ones are no servos
 for undulation."""
 
+FIRST_POLISHES = 2
+"""Steps of Gauss and Newton after which the orders are compared, and one of them goes on."""
+
+DAMPINGS = (1.0, HALF)
+"""Two equal poles, and the overshoot of a tenth that servos are tuned to at most."""
+
 BLOCKS = 30
 """Blocks of the trimmed squares: multiples of three, of which a third is ten."""
 
-DELAYS = 7
-"""Delays of the first grid, 0 to :data:`LATEST_S`; halved steps refine it."""
+SEARCH = 5
+"""Of the first grid the delays, and the time constants, each half of the one before; refinements of
+it, which come from a grid of 75 ms within the 10 ms in which steps of Gauss and Newton converge;
+such steps, each of which doubles the digits; concentration steps, which converge in three to five
+(2006, section 3)."""
 
-CONSTANTS = 5
-"""Time constants of the first grid, each half of the one before."""
+DIFFERENCE_S = float(np.sqrt(np.finfo(np.float64).eps))
+"""Difference by which slopes are taken [s]."""
 
-ROUNDS = 5
-"""Refinements, of which each moves on by the present step or halves it, before the steps of Gauss
-and Newton: from a grid of 50 ms they come within the 10 ms in which these converge."""
+SETTLED = float(-np.log(NEGLIGIBLE))
+"""Time constants after which a pole has settled, to 1 %."""
 
-POLISHES = 8
-"""Steps of Gauss and Newton at most; each doubles the digits once it is near."""
-
-FIRST_POLISHES = 2
-"""Of them those after which the orders are compared, and one of them goes on."""
-
-DIFFERENCE_S = 1e-3
-"""Difference by which slopes are taken [s]: small against all lags of servos."""
-
-DAMPINGS = (1.0, 0.5)
-"""Two equal poles, and the overshoot of a tenth that servos are tuned to at most."""
-
-SETTLED = 5
-"""Time constants after which a pole has settled, to exp(-5) = 0.7 %."""
+PARTS = FEWEST
+"""Of a course that is longer than :data:`FIT_STEPS`."""
 
 FIT_STEP_S = 0.02
 """Steps of the fit [s], or the course's where they are longer: ten samples of a period at 5 Hz."""
 
-FIT_STEPS = 8192
+FIT_STEPS = 1 << 13
 """Steps that are fitted; of a longer course eight parts of a thousand, evenly spread."""
-
-PARTS = 8
-"""Of a course that is longer than :data:`FIT_STEPS`."""
-
-BY_TIME = 0.01
-"""Share of a block's travel that time alone makes: blocks don't all end where a command rests."""
-
-STEPS_OF_C = 4
-"""Concentration steps: they converge in three to five (2006, section 3)."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +90,7 @@ class Response:
         return self.delay_s + self.constant_s * (0, 1, 2 * self.damping)[self.order]
 
 
-USUAL = Response(constant_s=0.1, order=1)
+USUAL = Response(constant_s=QUARTER * SLOWEST_S, order=1)
 """What a servo of a bandwidth of 1.6 Hz makes of a command: what is faster hardly moves it, and
 doesn't make blocks."""
 
@@ -118,7 +107,7 @@ class Filtered:
         """
         self._steps = command.shape[1]
         self._pad = int(np.ceil((LATEST_S + SETTLED * SLOWEST_S) / step_s)) + 1
-        self._size = _fast_size(self._steps + 2 * self._pad)
+        self._size = next_fast_len(self._steps + 2 * self._pad, real=True)
         after = self._size - self._steps - self._pad
         self._spectrum = np.fft.rfft(np.pad(command, ((0, 0), (self._pad, after)), mode="edge"))
         self._turn = 2j * np.pi * np.fft.rfftfreq(self._size, step_s)
@@ -138,12 +127,6 @@ class Filtered:
             factor /= 1 + turn * first + turn**2 * second
         whole = np.fft.irfft(self._spectrum[None] * factor[:, None], self._size)
         return np.asarray(whole[:, :, self._pad : self._pad + self._steps], dtype=np.float64)
-
-
-def _fast_size(least: int) -> int:
-    """Return the least size of the form 2^k or 5 * 2^k, which transform fast."""
-    power = 1 << (least - 1).bit_length()
-    return 5 * power // 8 if 5 * power // 8 >= least else power
 
 
 def fit_response(
@@ -168,8 +151,8 @@ def fit_response(
     trimmed = _Trimmed(filtered.output(USUAL), y, there.astype(np.float64))
     bounds = _bounds(command, step_s)
     best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids(*bounds)]
-    steps = [bounds[0] / (DELAYS - 1) / 2] * len(best)
-    for _ in range(ROUNDS):
+    steps = [bounds[0] / (SEARCH - 1) / 2] * len(best)
+    for _ in range(SEARCH):
         moved = [_moved(best[k][1], steps[k], *bounds) for k in range(len(best))]
         outputs = filtered.outputs([response for some in moved for response in some])
         ends = np.cumsum([len(some) for some in moved])
@@ -181,7 +164,7 @@ def fit_response(
             else:
                 steps[k] /= 2
     best = [_polished(fit, trimmed, filtered, bounds, FIRST_POLISHES) for fit in best]
-    return _polished(min(best, key=_merit), trimmed, filtered, bounds, POLISHES)[1]
+    return _polished(min(best, key=_merit), trimmed, filtered, bounds, SEARCH)[1]
 
 
 def _polished(
@@ -202,7 +185,7 @@ def _polished(
                 delay_s=min(max(centre.delay_s + delay / 2**k, 0.0), bounds[0]),
                 constant_s=min(max(centre.constant_s + constant / 2**k, 0.0), bounds[1]),
             )
-            for k in range(STEPS_OF_C)  # where the whole step goes too far
+            for k in range(SEARCH)  # where the whole step goes too far
         ]
         better = trimmed.best(filtered.outputs(moved), moved, keep)
         if _merit(better) >= _merit(fit):
@@ -218,14 +201,14 @@ def _bounds(command: FloatArray, step_s: float) -> tuple[float, float]:
     would be one that is late by half a cycle.
     """
     cycle = cycle_s(command, step_s)
-    return min(LATEST_S, cycle / 4), min(SLOWEST_S, cycle / (2 * np.pi))
+    return min(LATEST_S, QUARTER * cycle), min(SLOWEST_S, cycle / (2 * np.pi))
 
 
 def _grids(latest_s: float, slowest_s: float) -> tuple[list[Response], ...]:
     """Return the responses that the search begins with, by their order."""
-    delays = np.linspace(0, latest_s, DELAYS).tolist()
-    constants = [slowest_s / 2**k for k in range(CONSTANTS)]
-    few = delays[:: DELAYS // 2]
+    delays = np.linspace(0, latest_s, SEARCH).tolist()
+    constants = [slowest_s / 2**k for k in range(SEARCH)]
+    few = delays[:: SEARCH // 2]
     return (
         [Response(delay_s=delay) for delay in delays],
         [Response(1.0, 0.0, delay, constant, 1) for delay in few for constant in constants],
@@ -276,7 +259,7 @@ class _Trimmed:
     def __init__(self, motion: FloatArray, position: FloatArray, weight: FloatArray) -> None:
         travel = np.abs(np.diff(motion, axis=1, prepend=motion[:, :1])) * weight
         total = float(travel.sum())
-        parts = (travel / total if total > 0 else 0.0) + BY_TIME * weight / weight.sum()
+        parts = (travel / total if total > 0 else 0.0) + NEGLIGIBLE * weight / weight.sum()
         share: FloatArray = np.cumsum(parts.ravel())
         targets: FloatArray = share[-1] * np.arange(BLOCKS, dtype=np.float64) / BLOCKS
         edges = np.searchsorted(share, targets).astype(np.int64)
@@ -287,9 +270,9 @@ class _Trimmed:
         rows = self._weight * np.stack([np.ones_like(self._y), self._y, self._y**2])
         self._of_y = np.add.reduceat(rows, self._edges, axis=1)
         blocks = self._edges.size
-        self._keep = max(1, int(np.ceil(blocks * 2 / 3)))
+        self._keep = max(1, int(np.ceil(WHOLE * blocks - NEGLIGIBLE)))
         third = blocks - self._keep
-        starts = np.ones((1 + (BLOCKS // 5 if third else 0), blocks))
+        starts = np.ones((1 + (SEARCH + 1 if third else 0), blocks))
         for row, first in enumerate(np.linspace(0, self._keep, len(starts) - 1, dtype=int), 1):
             starts[row, first : first + third] = 0
         self._starts = starts
@@ -317,7 +300,7 @@ class _Trimmed:
         starts = self._starts if keep is None else keep[None, :]
         kept = np.broadcast_to(starts, (len(responses), *starts.shape))
         gain, offset, squares, kept = self._concentrated(sums, kept)
-        for _ in range(STEPS_OF_C - 1 if keep is None else 0):
+        for _ in range(SEARCH - 1 if keep is None else 0):
             gain, offset, squares, kept = self._concentrated(sums, kept)
         left = np.sum(kept * squares, axis=2)
         r, k = (int(index) for index in np.unravel_index(np.argmin(left), left.shape))
@@ -351,10 +334,8 @@ class _Trimmed:
         left = self._y + self._middle - centre.offset_rad - centre.gain * x
         weighted = design * kept[:, None]
         gram = weighted.T @ design
-        scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
-        solution = np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-10) @ (
-            (weighted.T @ left) / scale
-        )
+        scale = np.sqrt(np.maximum(np.diagonal(gram), TINY))
+        solution = np.linalg.pinv(gram / np.outer(scale, scale)) @ ((weighted.T @ left) / scale)
         return [float(value) for value in (solution / scale)[2:]]
 
     def _concentrated(

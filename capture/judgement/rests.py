@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import FloatArray
-from .exposure import LARGEST_REST_RAD, Exposure, responds
+from .exposure import Exposure, responds
+from .levels import LARGEST_REST_RAD
 from .motion import Course
 from .stillness import Stillness
 

@@ -6,21 +6,18 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ..common.arrays import FloatArray, IntArray
+from ..common.arrays import NS, FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
 from ..log.messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..log.read.facts import TIMES_FROM_FPS
 from ..log.read.joint_messages import UNITS
-from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
+from ..log.read.sample_times import LARGEST, MOST_JOINTS, Signal, longest_unbroken
 from ..log.read.session_view import SessionView
 from ..robot.model import Joint, Seat
 from .fault import Judgement
 from .judge import judge
 from .motion import JointMotion, Samples
 from .publishers import are_of_two_nodes
-
-MOST_JOINTS = 2000
-"""Of a session whose joints are judged; a file that claims more of them describes no robot."""
 
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
 
@@ -160,6 +157,6 @@ class _Times:
             if self._window_ns is not None:
                 part = slice(*np.searchsorted(t_ns, self._window_ns).tolist())
             inside = t_ns[part]
-            t_s = (inside - self._origin_ns).astype(np.float64) * 1e-9
+            t_s = (inside - self._origin_ns).astype(np.float64) / NS
             self._converted_times[id(t_ns)] = part, inside, t_s
         return self._converted_times[id(t_ns)]

@@ -20,22 +20,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ..common.arrays import FloatArray, IntArray
-
-LEVEL = 0.01
-"""Chance of any change in a session of healthy joints."""
-
-FEWEST = 8
-"""Blocks that a comparison needs (with fewer, 1 % of all changes has no threshold)."""
-
-ROBUST = 1.4826
-"""Standard deviation of normal values in their median distance from the middle."""
-
-TINY = float(np.finfo(np.float64).tiny)
-"""What stands for 0 in a denominator."""
-
-TAME = 4
-"""Robust standard deviations of a block beyond which a sample has no more weight: of normal noise
-6 in 100,000 are, and single samples of heavy tails decide nothing (Huber)."""
+from .levels import COVERAGE, FEWEST, LEVEL, ROBUST, TAME, TINY
 
 
 @dataclass(frozen=True)
@@ -93,11 +78,11 @@ def correlation_of(values: FloatArray, weights: FloatArray) -> float:
         kept = value[weight > 0]
         if kept.size >= FEWEST:
             away = kept - np.median(kept)
-            away = np.clip(away, *(np.quantile(away, (0.05, 0.95))))
+            away = np.clip(away, *np.quantile(away, (1 - COVERAGE, COVERAGE)))
             power = float(away @ away)
             rho = float(away[1:] @ away[:-1]) / power if power > 0 else 0.0
             found.append(rho + (1 + 4 * max(rho, 0.0)) / kept.size)
-    return min(max(float(np.median(found)), 0.0), 0.95) if found else 0.0
+    return min(max(float(np.median(found)), 0.0), COVERAGE) if found else 0.0
 
 
 def largest_shift(
@@ -128,7 +113,8 @@ def largest_shift(
         change, outside, error = _fitted(v, w, first, last, rho)
         if compared:
             error = np.maximum(error, _plain_error(v, w, first, last, rho))
-        limit = -float(stdtrit(known.size - 3, LEVEL / 4 / tests / first.size))
+        freedom = known.size - 2 - 1  # two means, and where the run is
+        limit = -float(stdtrit(freedom, LEVEL / 2 / 2 / tests / first.size))
         t = np.abs(change) / error
         k = int(np.argmax(t))
         if t[k] > limit and (best is None or t[k] / limit > best[0]):
@@ -160,11 +146,11 @@ def drift_of(values: FloatArray, weights: FloatArray, rho: float, tests: int) ->
     change = float(w @ (x * v)) / power
     left = v - float(w @ v) / float(w.sum()) - change * x
     freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
-    error = max(float(w @ left**2) / freedom / power, TINY) ** 0.5
+    error = float(np.sqrt(max(float(w @ left**2) / freedom / power, TINY)))
     limit = -float(stdtrit(max(freedom, 1.0), LEVEL / 2 / tests))
     # Heavy tails make slopes, and no order of ranks.
     rank = abs(rank_correlation(v))
-    by_rank = rank * (freedom / max(1 - rank**2, TINY)) ** 0.5
+    by_rank = rank * float(np.sqrt(freedom / max(1 - rank**2, TINY)))
     if min(abs(change) / error, by_rank) < limit:
         return None
     return Shift(change, float(w @ v) / float(w.sum()), error, 0, values.size, change**2 * power)
@@ -219,8 +205,8 @@ def _fitted(
     whole = _whitened(scale, rho)
     target = _whitened(scale * v, rho)
     # A whitened run is that of all blocks inside, and differs where it begins and after its end.
-    begin = scale * np.where(np.arange(v.size) == 0, (1 - rho**2) ** 0.5, 1.0)
-    sums = np.concatenate([np.zeros((2, 1)), np.cumsum([whole**2, whole * target], axis=1)], axis=1)
+    begin = scale * np.where(np.arange(v.size) == 0, np.sqrt(1 - rho**2), 1.0)
+    sums = np.pad(np.cumsum([whole**2, whole * target], axis=1), ((0, 0), (1, 0)))
     after = np.minimum(last, v.size - 1)
     behind = np.where(last < v.size, -rho * scale[last - 1], 0.0)
     own, of_target = sums[:, last] - sums[:, first + 1]
@@ -231,7 +217,7 @@ def _fitted(
     free = np.maximum(power - along**2 / level, TINY)
     change = (moment - along * total / level) / free
     left = float(target @ target) - total**2 / level - change**2 * free
-    variance = np.maximum(left, TINY) / max(v.size - 3, 1) / free
+    variance = np.maximum(left, TINY) / max(v.size - 2 - 1, 1) / free
     return change, (total - change * along) / level, np.sqrt(variance)
 
 
@@ -239,7 +225,7 @@ def _plain_error(
     v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
 ) -> FloatArray:
     """Return the standard error of the difference of means in and out of runs."""
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([w, w * v, w * v**2], axis=1)], axis=1)
+    sums = np.pad(np.cumsum([w, w * v, w * v**2], axis=1), ((0, 0), (1, 0)))
     inside = sums[:, last] - sums[:, first]
     (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
     squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
@@ -251,5 +237,5 @@ def _whitened(values: FloatArray, rho: float) -> FloatArray:
     """Take the autoregression off, the first value scaled as all before would have made it."""
     result = values.copy()
     result[1:] -= rho * values[:-1]
-    result[0] *= (1 - rho**2) ** 0.5
+    result[0] *= np.sqrt(1 - rho**2)
     return result

@@ -12,9 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
-from .exposure import COHERENT, RESPONDS
 from .fault import Span
+from .levels import GAIN_MARGIN, HALF, QUARTER, TINY
 from .motion import JointMotion, Samples
+
+NEAR_LIMIT = GAIN_MARGIN
+"""Share of a joint's range within which it is at its limit."""
+
+AGAIN = 2
+"""Times beyond which it is no chance that a joint stands at one end of its motion: twice is one in
+four."""
 
 POWERLESS = 0.15
 """Share of the usual effort below which a motor doesn't drive its joint: the friction of geared
@@ -23,12 +30,6 @@ hobby servos without load is a tenth of their torque."""
 PUSHES = 1.5
 """Times the usual effort from which a motor pushes against something: of a sine the mean size is
 2/pi of the largest, so a motor at its limit gives 1.6."""
-
-NEAR_LIMIT = 0.02
-"""Share of a joint's range within which it is at its limit: two steps of 1 %."""
-
-AGAIN = 3
-"""Times that a joint stands at one end of its motion, which is no chance: twice is one in four."""
 
 
 def standing_kinds(
@@ -85,7 +86,7 @@ def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
     t_s, position = motion.position.t_s, motion.position.values
     if motion.reference is not None and motion.reference.t_s.size > AGAIN:
         along = _correlation(motion.reference.at(t_s), position)
-        if abs(along) > RESPONDS:
+        if abs(along) > QUARTER:
             return (
                 (("inverted_sensor",), "the second sensor moves with the command")
                 if along < 0
@@ -93,7 +94,7 @@ def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
             )
     if motion.velocity is not None and motion.velocity.t_s.size > AGAIN:
         rate = np.gradient(position, t_s)
-        if _correlation(motion.velocity.at(t_s), rate) < -RESPONDS:
+        if _correlation(motion.velocity.at(t_s), rate) < -QUARTER:
             return ("inverted_sensor",), "its velocity has the opposite sign of its position"
     return ("inverted", "inverted_sensor"), ""
 
@@ -138,8 +139,8 @@ def _moves(
     design = np.stack([asked, lagging], axis=1)
     factors = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
     left: FloatArray = values - design @ factors
-    explained = 1 - float(np.var(left)) / max(float(np.var(values)), 1e-300)
-    return bool(np.std(values) > RESPONDS * size and explained > COHERENT)
+    explained = 1 - float(np.var(left)) / max(float(np.var(values)), TINY)
+    return bool(np.std(values) > QUARTER * size and explained > HALF)
 
 
 def _effort(
@@ -155,7 +156,7 @@ def _effort(
         return None
     others = [_size(other.effort, spans, inside=True) for other in like if other is not motion]
     known = [size for size in others if size is not None]
-    usual = float(np.median(known)) if len(known) >= AGAIN else None
+    usual = float(np.median(known)) if len(known) > AGAIN else None
     if usual is None:
         usual = _size(motion.effort, spans, inside=False)
     return here / usual if usual else None
@@ -193,7 +194,7 @@ def _at_limit(motion: JointMotion, inside: BoolArray, spans: Sequence[Span]) -> 
     medians = [float(np.median(level)) for level in levels if level.size]
     slack = 2 * NEAR_LIMIT * motion.position.range
     low, high = float(values.min()), float(values.max())
-    return len(medians) >= AGAIN and (max(medians) <= low + slack or min(medians) >= high - slack)
+    return len(medians) > AGAIN and (max(medians) <= low + slack or min(medians) >= high - slack)
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> float:

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
-from .exposure import RESPONDS, Exposure, covered, window_ranges
+from .exposure import Exposure, covered, window_ranges
+from .levels import FULL, QUARTER
 from .motion import Course, cycle_s
 from .response import SETTLED
-
-FULL = 0.9
-"""Share of its samples that a window needs: of fewer it isn't known how far the joint moved."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def _of_joint(course: Course, exposure: Exposure, k: int) -> tuple[BoolArray, Bo
         wide = length + 2 * settling
         complete = absent[wide:] - absent[:-wide] <= (1 - FULL) * wide
         had_to = (healthy[inner] > least) & complete
-        still = had_to & (seen < RESPONDS * expected) & (expected > least)
+        still = had_to & (seen < QUARTER * expected) & (expected > least)
         exposed |= covered(had_to, wide, size)
         stands |= covered(still, wide, size)
     return exposed, stands
@@ -68,7 +66,7 @@ def _of_joint(course: Course, exposure: Exposure, k: int) -> tuple[BoolArray, Bo
 
 def _follows(exposure: Exposure, k: int) -> bool:
     """Return whether a joint's own response is that of a joint that follows."""
-    return exposure.responses[k].gain > RESPONDS * _gain(exposure, k)
+    return exposure.responses[k].gain > QUARTER * _gain(exposure, k)
 
 
 def _gain(exposure: Exposure, k: int) -> float:

@@ -27,6 +27,9 @@ from ..messages.cdr import layout_of
 if TYPE_CHECKING:
     import pandas as pd
 
+MOST_JOINTS = 2000
+"""Of a session; a file that claims more of them describes no robot."""
+
 LARGEST = 1e100
 """A larger value counts as missing: no sensor sends it, and its powers are not finite."""
 
