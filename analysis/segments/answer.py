@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
 from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
+from undulog.capture.judgement.naming import NAMED
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
@@ -22,10 +23,6 @@ from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import BodyWave, FreeMotion, JointFrequencyResponse
 from .examine import Findings
 
-NAMED = 4
-"""Joints that a sentence names at most; the others are counted."""
-
-_FLAGGED = 6
 _KIND_WORDS = {
     "at_limit": "at a limit",
     "swapped": "swapped with another joint",
@@ -476,8 +473,8 @@ def _caveat(joints: Sequence[JointResult]) -> str:
     named = [f"{plain(j.name)} ({', '.join(j.flags)})" for j in joints if j.flags]
     if not named:
         return ""
-    more = f" and {len(named) - _FLAGGED} more" if len(named) > _FLAGGED else ""
-    return f" Flagged, see the table of joints: {', '.join(named[:_FLAGGED])}{more}."
+    more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
+    return f" Flagged, see the table of joints: {', '.join(named[:NAMED])}{more}."
 
 
 def _why_not(facts: Facts, lacking: str) -> str:

@@ -32,7 +32,7 @@ _MARGINS = {"gain": EQUIVALENT_GAIN, "lag": EQUIVALENT_LAG_RAD}
 OFFSET_RAD = EQUIVALENT_LAG_RAD
 """Offsets below this are of no interest [rad]."""
 
-_MIN_CYCLES = 4
+_MIN_CYCLES = MIN_JOINTS
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     cycles = min(chain.offsets[chain.names[k]].size for k in index)
     rows = np.stack([chain.offsets[chain.names[k]][:cycles] for k in index])
     values = np.median(rows, axis=1)
-    columns = (rows - rows.mean(axis=1, keepdims=True)) / (cycles - 1) ** 0.5
+    columns = (rows - rows.mean(axis=1, keepdims=True)) / math.sqrt(cycles - 1)
     nothing = np.zeros(len(index))
     place = np.array([chain.commanded.index(chain.names[k]) for k in index], dtype=np.float64)
     scatter = Scatter(columns, nothing, nothing)

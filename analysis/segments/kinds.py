@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.judgement.levels import ENOUGH_LIKE, ROBUST
 
-from .outliers import ROBUST
+from .outliers import FAR
 
-FEWEST = 3
+FEWEST = ENOUGH_LIKE - 1
 """Joints of a kind, at least: of two, one may be a fault and the other chance."""
 
 
@@ -52,9 +53,9 @@ def split_of(values: FloatArray, margin: float) -> Split | None:
         low, high = order[:size], order[size:]
         gap = float(values[high[0]] - values[low[-1]])
         away = [np.abs(values[side] - np.median(values[side])) for side in (low, high)]
-        scatter = 1.4826 * float(np.median(np.concatenate(away)))
-        sure = gap / max(scatter, margin / (2 * ROBUST))
-        if gap > margin and sure > 2 * ROBUST and (best is None or sure > best.sure):
+        scatter = ROBUST * float(np.median(np.concatenate(away)))
+        sure = gap / max(scatter, margin / (2 * FAR))
+        if gap > margin and sure > 2 * FAR and (best is None or sure > best.sure):
             first, second = (low, high) if 0 in low else (high, low)
             best = Split(np.sort(first), np.sort(second), sure)
     if best is None:

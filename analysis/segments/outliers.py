@@ -9,16 +9,17 @@ moves no reference of the rest.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import combinations
-from math import comb
 
 import numpy as np
 from scipy.special import stdtrit
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.judgement.levels import HALF, LEVEL, ROBUST, TINY, WHOLE
 
 from .profile import (
     ENDS,
@@ -30,16 +31,16 @@ from .profile import (
     everyone,
 )
 
-ROBUST = 3.5
+FAR = 3.5
 """Robust standard deviations of the others' residuals beyond which a joint stands out."""
 
-MIRRORED = 0.5
+MIRRORED = HALF
 """Share of a joint's deviation, or its inverse, that its mirror joint shows, too, in a shape."""
 
-LOCAL = 0.5
+LOCAL = HALF
 """Share of a deviation that a joint shows beside its neighbours at least, out of a profile."""
 
-CHANCE = 0.01
+CHANCE = LEVEL
 """Chance that of joints of equal scatter one is taken to stand out, before the searches choose the
 rest that it is held against: with that it is 3 to 5 % for 6 to 13 joints (250 chains each)."""
 
@@ -51,9 +52,6 @@ MAX_DEGREE = 4
 
 SUBSETS = 400
 """Subsets of joints that the trimmed search begins from at most."""
-
-TRIMMED = 3
-"""One of so many joints may stand out of a trimmed fit."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,7 @@ def _grown(profile: Profile, critical: float) -> State:
 def _trimmed(profile: Profile, critical: float) -> State:
     """Least trimmed squares, then all joints that its scatter allows, the nearest first."""
     m = profile.values.size
-    columns = _smooth_columns(profile)[: 2 if m >= 7 else 1 if m >= 5 else 0]
+    columns = _smooth_columns(profile)[: 2 if m >= ENDS + MIDDLE else 1 if m >= MIDDLE else 0]
     state = State(_core(profile, columns), columns)
     while not state.active.all():
         ratio = np.where(state.active, np.inf, _excess(profile, state, critical))
@@ -146,7 +144,7 @@ def _trimmed(profile: Profile, critical: float) -> State:
         if ratio[nearest] > 1:
             break
         state.active[nearest] = True
-    if np.count_nonzero(~state.active) <= max(1, m // TRIMMED):
+    if np.count_nonzero(~state.active) <= max(1, int((1 - WHOLE) * m)):
         state.outside.extend(np.flatnonzero(~state.active).tolist())
     return state
 
@@ -157,7 +155,7 @@ def _core(profile: Profile, columns: Sequence[FloatArray]) -> BoolArray:
     half = (m + p + 1) // 2
     design = np.stack([np.ones(m), *columns], axis=1)
     subsets = _subsets(m, p)
-    for _ in range(3):  # concentration (Rousseeuw and Van Driessen, 2006)
+    for _ in range(2 + 1):  # concentration (Rousseeuw and Van Driessen, 2006)
         square = _squares(design, profile.values, subsets)
         subsets = np.argpartition(square, half - 1)[:, :half]
     square = np.take_along_axis(_squares(design, profile.values, subsets), subsets, axis=1)
@@ -167,7 +165,7 @@ def _core(profile: Profile, columns: Sequence[FloatArray]) -> BoolArray:
 @cache
 def _subsets(joints: int, size: int) -> IntArray:
     """All subsets, or as many random ones as are tried at most, shape (s, size)."""
-    if comb(joints, size) <= SUBSETS:
+    if math.comb(joints, size) <= SUBSETS:
         return np.array(list(combinations(range(joints), size)))
     return np.stack([np.random.default_rng(k).permutation(joints)[:size] for k in range(SUBSETS)])
 
@@ -188,17 +186,17 @@ def _excess(profile: Profile, state: State, critical: float) -> FloatArray:
     if spare < 1:
         return np.zeros(len(rows))
     deviation = rows @ profile.values
-    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
+    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), TINY)
     scatter = _limit(profile, spare) * _scatter((deviation / reach)[index], rows, index, spare)
     explained = np.maximum(critical * np.sqrt(profile.scatter.variance(rows)), scatter * reach)
-    return np.abs(deviation) / np.maximum(explained, 1e-300)
+    return np.abs(deviation) / np.maximum(explained, TINY)
 
 
 def _deviation_of(profile: Profile, state: State, joint: int) -> Deviation:
     """A joint's deviation from the prediction of those that are left."""
     row = deviation_weights(profile, state.active, state.shapes)[joint]
     variance = float(profile.scatter.variance(row[None, :])[0])
-    return Deviation(joint, float(row @ profile.values), variance**0.5)
+    return Deviation(joint, float(row @ profile.values), math.sqrt(variance))
 
 
 def _worst(profile: Profile, state: State, critical: float) -> tuple[int | None, float]:
@@ -206,7 +204,7 @@ def _worst(profile: Profile, state: State, critical: float) -> tuple[int | None,
     rows = deviation_weights(profile, state.active, state.shapes)
     value = rows @ profile.values
     error = np.sqrt(profile.scatter.variance(rows))
-    score = np.where(state.active, np.abs(value) / np.maximum(error, 1e-300), 0.0)
+    score = np.where(state.active, np.abs(value) / np.maximum(error, TINY), 0.0)
     for joint in np.argsort(-score).tolist():
         if score[joint] <= critical:
             break
@@ -230,8 +228,8 @@ def _steepest(
         row = coefficient_weights(column, basis, weight)
         if row is None:
             continue
-        error = float(profile.scatter.variance(row[None, :])[0]) ** 0.5
-        score = abs(float(row @ profile.values)) / max(error, 1e-300)
+        error = math.sqrt(float(profile.scatter.variance(row[None, :])[0]))
+        score = abs(float(row @ profile.values)) / max(error, TINY)
         if score > largest:
             best, largest = column, score
     return best, largest
@@ -242,7 +240,7 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
     x = profile.along
     columns = [np.asarray(x**degree) for degree in range(1, MAX_DEGREE + 1)]
     if profile.count >= ENDS + MIDDLE:
-        columns.append((np.abs(x) > 1 - 1e-9).astype(np.float64))
+        columns.append(np.isclose(np.abs(x), 1).astype(np.float64))
     return columns
 
 
@@ -259,13 +257,13 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
     index = np.flatnonzero(others)
     rows = deviation_weights(profile, others, state.shapes)
     # Of equal scatter, a deviation has that of its weights: more at an end, where a shape leads on.
-    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
+    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), TINY)
     residual = (rows @ profile.values / reach)[index]
     spare = index.size - 1 - len(state.shapes)
     centred = np.abs(residual - np.median(residual))
-    robust = 1.4826 * float(np.median(centred)) * (index.size / max(spare, 1)) ** 0.5
+    robust = ROBUST * float(np.median(centred)) * np.sqrt(index.size / max(spare, 1))
     size = abs(one.value) / float(reach[one.joint])
-    if spare < 1 or size <= ROBUST * robust:
+    if spare < 1 or size <= FAR * robust:
         return False
     typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
     scatter = _scatter(residual, rows, index, spare)
@@ -281,7 +279,7 @@ def _scatter(residual: FloatArray, rows: FloatArray, others: IntArray, spare: in
 
     The leave-one-out residuals are e / (1 - h) with weights of norm (1 - h)^-1/2.
     """
-    norm = np.maximum(np.sqrt(np.sum(rows[others] ** 2, axis=1)), 1e-300)
+    norm = np.maximum(np.sqrt(np.sum(rows[others] ** 2, axis=1)), TINY)
     return float(np.sqrt(np.sum((residual / norm) ** 2) / spare))
 
 

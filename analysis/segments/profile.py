@@ -27,20 +27,35 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.judgement.levels import COVERAGE, ENOUGH_LIKE, REST_ERRORS, TINY
 
 from ..estimators.intervals import ResponseErrors
 
-LEVEL = 0.05
+LEVEL = 1 - COVERAGE
 """Family-wise level of all statements together."""
 
+MIN_JOINTS = ENOUGH_LIKE
+"""Fewer sound joints can't say which of them differs."""
+
+NOISIER = REST_ERRORS
+"""Variance, in medians of all joints', from which a joint counts less."""
+
+ENDS, MIDDLE = 2, 5
+"""Joints that are the ends of a chain, and those that are its middle."""
+
 DRAWS = 2000
+"""Of the simulation: the standard error of a level of 5 % is then a tenth of it."""
+
 SEED = 20110901
 """Of the simulation, fixed: the same data give the same intervals."""
 
-_BLOCK, _KEPT = 1 << 21, 1 << 23
-"""Normal numbers that are drawn at a time, and that are kept for the next session, at most."""
+EPS = float(np.finfo(np.float64).eps)
 
-_TINY = 1e-300
+_BLOCK = 1 << 21
+"""Normal numbers that are drawn at a time, at most: 16 MB."""
+
+_KEPT = 2 * 2 * _BLOCK
+"""Normal numbers that are kept for the next session, at most."""
 
 
 @dataclass(frozen=True)
@@ -173,35 +188,26 @@ def _largest(member: Member, normals: _Normals) -> FloatArray:
     count = columns.shape[1]
     shrink = _shrinkage(columns)
     sigma = np.sqrt(np.mean(columns**2, axis=1))
-    shared, single = ((1 - shrink) / count) ** 0.5, shrink**0.5
+    shared, single = np.sqrt((1 - shrink) / count), np.sqrt(shrink)
     blocks = _product(shared * weights @ columns, normals.shared)
     blocks += _product(single * weights * sigma, normals.single)
     error = blocks[..., -1] + _product(weights * np.sqrt(scatter.own), normals.own)
     error += _product((weights @ scatter.turn)[:, np.newaxis], normals.turn)
     variance = np.mean(blocks[..., :-1] ** 2, axis=-1)
     variance += (weights**2 @ scatter.own + (weights @ scatter.turn) ** 2)[:, np.newaxis]
-    return np.max(np.abs(error) / np.sqrt(np.maximum(variance, _TINY)), axis=0)
+    return np.max(np.abs(error) / np.sqrt(np.maximum(variance, TINY)), axis=0)
 
 
 def _shrinkage(columns: FloatArray) -> float:
     """Return the share of the diagonal in the shrunk covariance, 0 to 1."""
     joints, count = columns.shape
-    sigma = np.sqrt(np.maximum(np.mean(columns**2, axis=1), _TINY))
+    sigma = np.sqrt(np.maximum(np.mean(columns**2, axis=1), TINY))
     correlation = (columns / sigma[:, None]) @ (columns / sigma[:, None]).T / count
     off = ~np.eye(joints, dtype=np.bool_)
     squares = float(np.sum(correlation[off] ** 2))
     if squares == 0:
         return 1.0
     return float(np.clip(float(np.sum((1 + correlation[off] ** 2) / count)) / squares, 0.0, 1.0))
-
-
-MIN_JOINTS = 4
-"""Fewer sound joints can't say which of them differs."""
-
-NOISIER = 3.0
-"""Variance, in medians of all joints', from which a joint counts less."""
-
-ENDS, MIDDLE = 2, 5
 
 
 @dataclass(frozen=True)
@@ -234,7 +240,7 @@ class Profile:
         estimated too small, and make intervals too narrow.
         """
         own = self.scatter.variance(np.eye(self.values.size))
-        return 1 / np.maximum(own, max(NOISIER * float(np.median(own)), 1e-300))
+        return 1 / np.maximum(own, max(NOISIER * float(np.median(own)), TINY))
 
 
 @dataclass(frozen=True)
@@ -281,17 +287,18 @@ def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatA
     found: list[tuple[str, FloatArray]] = []
     x = profile.along
     index = np.flatnonzero(active)
-    if index.size < 3:
+    if index.size <= 2:
         return found
     if profile.count >= ENDS + MIDDLE and index.size >= ENDS + 2:
         distance = np.abs(x)
-        outer = active & (distance > 1 - 1e-9)
-        inner = active & (distance < (MIDDLE + 1) / max(profile.count - 1, 1) - 1e-9)
+        outer = active & np.isclose(distance, 1)
+        limit = (MIDDLE + 1) / max(profile.count - 1, 1)
+        inner = active & (distance < limit) & ~np.isclose(distance, limit)
         if np.count_nonzero(outer) == ENDS and inner.any():
             row = outer / np.count_nonzero(outer) - inner / np.count_nonzero(inner)
             found.append(("ends", row.astype(np.float64)))
     weight = np.where(active, profile.precision, 0.0)
-    for kind, column, span in (("trend", x, 2.0), ("mirror", np.abs(x), 0.5)):
+    for kind, column, span in (("trend", x, 2.0), ("mirror", np.abs(x), 1 / 2)):
         basis = [np.ones(size)] if kind == "trend" else [np.ones(size), x]
         if index.size > len(basis) + 1:
             row = coefficient_weights(column, basis, weight)
@@ -314,15 +321,15 @@ def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
         variance = float(profile.scatter.variance(row[None, :])[0])
         value = float(row @ profile.values)
         # A contrast c^T y of unit weights explains (c^T y)^2 / c^T c of the sum of squares.
-        spread = abs(value) / float(row @ row * np.count_nonzero(active)) ** 0.5
-        found.append(Contrast(kind, value, variance**0.5, spread))
+        spread = abs(value) / float(np.sqrt(row @ row * np.count_nonzero(active)))
+        found.append(Contrast(kind, value, math.sqrt(variance), spread))
     if np.count_nonzero(active) > 1:
         rows = deviation_weights(profile, active, [])
         index = np.flatnonzero(active)
         value = rows[index] @ profile.values
         error = np.sqrt(profile.scatter.variance(rows[index]))
-        k = int(np.argmax(np.abs(value) / np.maximum(error, 1e-300)))
-        spread = abs(float(value[k])) / index.size**0.5
+        k = int(np.argmax(np.abs(value) / np.maximum(error, TINY)))
+        spread = abs(float(value[k])) / math.sqrt(index.size)
         found.append(Contrast("each", float(value[k]), float(error[k]), spread, int(index[k])))
     return found
 
@@ -350,7 +357,7 @@ def deviation_weights(
     hat = design @ np.linalg.pinv(design.T @ (weight[:, None] * design)) @ (design.T * weight)
     # Of a joint that takes part, the leave-one-out residual: (1 - h_ii)^-1 of the residual.
     lever = np.where(active, np.diag(hat), 0.0)
-    return np.asarray((np.eye(size) - hat) / np.maximum(1 - lever, 1e-9)[:, None], dtype=np.float64)
+    return np.asarray((np.eye(size) - hat) / np.maximum(1 - lever, EPS)[:, None], dtype=np.float64)
 
 
 def coefficient_weights(
@@ -361,6 +368,6 @@ def coefficient_weights(
     solve = np.linalg.pinv(design.T @ (weight[:, None] * design)) @ (design.T * weight)
     rest = column - design @ (solve @ column)
     power = float(rest @ (weight * rest))
-    if power <= 1e-12 * float(weight.sum()):
+    if power <= EPS * float(weight.sum()):
         return None
     return np.asarray(weight * rest / power, dtype=np.float64)
