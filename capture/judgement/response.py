@@ -21,7 +21,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from .levels import FEWEST, HALF, NEGLIGIBLE, QUARTER, TINY, WHOLE
+from .levels import COVERAGE, FEWEST, HALF, NEGLIGIBLE, QUARTER, TINY, WHOLE
 from .motion import cycle_s
 
 LATEST_S = 0.3
@@ -163,8 +163,12 @@ def fit_response(
                 best[k] = better
             else:
                 steps[k] /= 2
-    best = [_polished(fit, trimmed, filtered, bounds, FIRST_POLISHES) for fit in best]
-    return _polished(min(best, key=_merit), trimmed, filtered, bounds, SEARCH)[1]
+    chosen, *others = (_polished(fit, trimmed, filtered, bounds, FIRST_POLISHES) for fit in best)
+    for fit in others:
+        # A pole more takes off a twentieth of the squares, or the simpler response stands.
+        if fit[0] < COVERAGE * chosen[0]:
+            chosen = fit
+    return _polished(chosen, trimmed, filtered, bounds, SEARCH)[1]
 
 
 def _polished(
