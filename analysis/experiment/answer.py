@@ -251,7 +251,7 @@ def experiment_answer(
 
     Args:
         reversal: Its result, or None.
-        roles: Of the runs that have one.
+        roles: Of the runs that have one. Of too few of a direction nothing is decided.
         pooled: The response over the runs of one direction, None where both were recorded.
         joints: Its answer on the joints.
 
@@ -264,6 +264,8 @@ def experiment_answer(
         return _one_direction(pooled, joints)
     if reversal is None:
         return "both directions, but not separable from these sessions"
+    if reversal.p_floor >= SIGNIFICANT:
+        return _too_few(reversal)
     return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)
 
 
@@ -333,6 +335,14 @@ def _different(reversal: Reversal) -> str:
     lead = "the modules differ: " if reversal.tilt.excluded else ""
     doubt = formats.p_value_text(first.p)
     return f"{lead}{pair_order(first)} ({doubt}): {either}{also if others else ''}"
+
+
+def _too_few(reversal: Reversal) -> str:
+    runs = f"{reversal.forward_runs} + {reversal.reverse_runs} runs"
+    return (
+        f"not decided: with {runs} no difference of a module can be shown, as p can't go below "
+        f"{reversal.p_floor:.2g}; record at least 6 of each direction"
+    )
 
 
 def _bounded(reversal: Reversal) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..common.arrays import FloatArray
+from ..log.read.sample_times import LARGEST
 from .levels import ANGLE_MARGIN_RAD, FEWEST, HALF, QUARTER
 
 
@@ -22,7 +23,7 @@ def are_of_two_nodes(series: Iterable[FloatArray]) -> bool:
     Args:
         series: Values of each joint in their order, those of one time, too, shape (n_j,) each.
     """
-    votes = [_in_turn(values[np.isfinite(values)]) for values in series]
+    votes = [_in_turn(values[np.abs(values) <= LARGEST]) for values in series]
     moving = [vote for vote in votes if vote is not None]
     return 2 * sum(moving) > len(moving) > 1
 

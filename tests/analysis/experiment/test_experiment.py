@@ -118,6 +118,17 @@ def test_a_weak_module_is_named(weak):
     assert by_name["joint13"].mirror == "joint13"
 
 
+@pytest.mark.slow
+def test_of_two_runs_each_way_nothing_is_decided(weak):
+    result = experiment(weak[:4])
+    assert result.answer == (
+        "not decided: with 2 + 2 runs no difference of a module can be shown, as p can't go below "
+        "0.33; record at least 6 of each direction"
+    )
+    assert result.reversal.pairs == ()
+    assert result.reversal.p >= result.reversal.p_floor
+
+
 @pytest.mark.nightly
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
