@@ -407,11 +407,9 @@ def judge_following(fault: JointFault) -> Finding:
 
 
 def judge_differences(judgement: Judgement) -> Iterator[Finding]:
-    """Yield findings on joints that changed, or that move besides their command, and on names."""
-    if judgement.naming:
-        yield Finding(1, judgement.naming)
-    for difference in (*judgement.changes, *judgement.extra):
-        yield Finding(1, clause_of(difference, difference.joint))
+    """Yield findings on names, and on joints that changed, or that move besides their command."""
+    found = [clause_of(each, each.joint) for each in (*judgement.changes, *judgement.extra)]
+    yield from (Finding(1, clause) for clause in (judgement.naming, *found) if clause)
 
 
 def judge_bus(health: BusHealth) -> Iterator[Finding]:
