@@ -66,5 +66,5 @@ are, and single samples of heavy tails decide nothing (Huber)."""
 MISSING = 1.5
 """Sampling intervals from which one lacks a sample: with less, jitter and rounding decide."""
 
-TINY = float(np.finfo(np.float64).tiny)
-"""What stands for 0 in a denominator."""
+TINY = float(np.sqrt(np.finfo(np.float64).tiny))
+"""What stands for 0 in a denominator; its inverse may be squared."""

@@ -11,6 +11,8 @@ from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.replay.reproduce import compare_logs
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
@@ -31,7 +33,6 @@ def again(room, output, *words, source="run.mcap", code=0):
     return output
 
 
-@pytest.mark.slow
 def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, capsys):
     path = tmp_path / "a.mcap"
     path.write_text("mine")
@@ -121,13 +122,11 @@ def test_a_message_that_only_one_has_is_a_difference(tmp_path):
     assert (found.exact, found.differs_s, found.messages) == (False, {"/mode": 3.0}, 3)
 
 
-@pytest.mark.slow
 def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
     again(room, tmp_path / "a.mcap", "--duration", "0.5", "--set", "servo.stall_torque=0.3")
     assert "Not compared: " in capsys.readouterr().out
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

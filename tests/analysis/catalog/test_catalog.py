@@ -240,6 +240,7 @@ def test_parts_of_a_session_are_one_row(tmp_path):
         assert rows.start_ns["run.mcap"] == session.start_ns
 
 
+@pytest.mark.slow
 def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path, opened):
     logs = [
         [

@@ -67,7 +67,6 @@ def test_bags_are_rows_with_the_facts_of_their_sessions(bags):
         assert row["size"] == sum(file.stat().st_size for file in files)
 
 
-@pytest.mark.slow
 def test_bags_are_opened_again_only_when_a_file_of_theirs_has_changed(bags):
     catalog = Catalog(str(bags))
     catalog.scan()
@@ -156,7 +155,6 @@ DIFFERENT = {"one.bag", "sql"}
 """ROS 1 and ROS 2; the others are MCAP."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=() if n in DIFFERENT else pytest.mark.nightly) for n in KINDS],

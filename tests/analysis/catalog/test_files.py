@@ -159,7 +159,6 @@ def test_the_command_reports_the_damage(lab, command):
     assert command("catalog", lab).err == ""
 
 
-@pytest.mark.slow
 def test_files_of_an_earlier_version_are_read_and_replaced_by_whole_ones(lab):
     before = Catalog(str(lab)).find()
     for path in (lab / FOLDER).rglob("*.parquet"):

@@ -13,6 +13,8 @@ from undulog.analysis.catalog.catalog import Catalog
 from undulog.analysis.catalog.queries import query_process
 from undulog.capture.common.errors import DamagedFileError, UsageError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
@@ -35,21 +37,18 @@ CONDITIONS = [
     "1=1; attach 'out.db'; --",
     "path in (select a from read_csv('secret.csv'))",
     "not " * 20_000,
-    pytest.param("path in (select content from read_text('secret.csv'))", marks=pytest.mark.slow),
-    pytest.param("path in (select file from glob('/*'))", marks=pytest.mark.slow),
-    pytest.param(
-        "1=1 union select * from read_parquet('lab/.undulog-catalog/sources/*.parquet') --",
-        marks=pytest.mark.slow,
-    ),
-    pytest.param("path in (select a from 'secret.csv')", marks=pytest.mark.slow),
-    pytest.param("1=1; set memory_limit = '64GB'", marks=pytest.mark.slow),
-    pytest.param("1=1; install httpfs", marks=pytest.mark.slow),
-    pytest.param("path in (select a from 'https://127.0.0.1:1/a.csv')", marks=pytest.mark.slow),
-    pytest.param("1=1; drop view catalog", marks=pytest.mark.slow),
-    pytest.param("path = 'a' or", marks=pytest.mark.slow),
-    pytest.param("\0", marks=pytest.mark.slow),
-    pytest.param("(" * 40_000, marks=pytest.mark.slow),
-    pytest.param("path = '" + "x" * 200_000 + "'", marks=pytest.mark.slow),
+    "path in (select content from read_text('secret.csv'))",
+    "path in (select file from glob('/*'))",
+    "1=1 union select * from read_parquet('lab/.undulog-catalog/sources/*.parquet') --",
+    "path in (select a from 'secret.csv')",
+    "1=1; set memory_limit = '64GB'",
+    "1=1; install httpfs",
+    "path in (select a from 'https://127.0.0.1:1/a.csv')",
+    "1=1; drop view catalog",
+    "path = 'a' or",
+    "\0",
+    "(" * 40_000,
+    "path = '" + "x" * 200_000 + "'",
 ]
 
 
@@ -100,7 +99,6 @@ LONG_OR_SIMILAR = (
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("query", "why"),
     [
@@ -125,7 +123,6 @@ PROMISED_S = 20
 """Most processor time that an input of any kind may take: docs/explanation/reliability.md."""
 
 
-@pytest.mark.slow
 def test_the_kernel_limits_the_processor_time_of_a_query_whose_end_is_told(lab):
     """Whole queries of that length are for the night; here SIGXCPU comes at once."""
     lab.sql("select 1")
@@ -155,7 +152,6 @@ def test_errors_come_back_as_what_they_are(lab, tmp_path):
     assert damaged.value.path.name == path.name
 
 
-@pytest.mark.slow
 def test_a_query_process_that_is_killed_is_replaced(lab):
     lab.sql("select 1")
     process = query_process()._process

@@ -108,6 +108,7 @@ def test_without_noise_only_the_sampling_is_left():
     assert max(errors) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.05, 0.1, 0.2])
 def test_locked_phases_are_refused(noise):
     rng = np.random.default_rng(5)

@@ -68,6 +68,7 @@ def test_a_kicked_session_gives_its_couplings(tmp_path, feedback, command, repor
     assert "Oscillators, horizontal: 10 couplings identified (condition number" in out
 
 
+@pytest.mark.slow
 def test_a_locked_session_is_refused(tmp_path, command, report_of):
     path = write(tmp_path / "locked.mcap", 10.0)
     (chain,) = report_of("analyse", path)["oscillators"]

@@ -14,6 +14,8 @@ from undulog.analysis import Estimate
 from undulog.analysis.present.page import render
 from undulog.analysis.results.coupling import Coupling
 
+pytestmark = pytest.mark.slow
+
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 NAMES = ["snake", "still", "single", "hostile"]
 
@@ -83,7 +85,6 @@ def numbers(cell):
     return [float(d.attributes["value"]) for d in cell.all("data")]
 
 
-@pytest.mark.slow
 def test_nothing_is_fetched_from_outside(page):
     root = tree(page)
     for node in root.all():
@@ -149,7 +150,6 @@ def test_what_scrolls_can_be_reached_by_the_keyboard(page):
             assert node.attributes["tabindex"] == "0"
 
 
-@pytest.mark.slow
 def test_headings_and_reason_of_a_missing_coupling(snake_page):
     root = tree(snake_page)
     headings = [h.text() for h in root.all("h1", "h2", "h3")]

@@ -19,6 +19,8 @@ from undulog.analysis.results.body import BodyConnection, PredictedTravel
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.formats import sentence
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def pages(both_ways, kicked, swept):
@@ -37,7 +39,6 @@ def rows(page, table):
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["both_ways", "kicked", "swept"])
 def test_the_answer_is_the_first_heading(pages, name, request):
     heading = re.search(r"<h1[^>]*>(.*?)</h1>", pages[name], re.DOTALL)[1]

@@ -9,6 +9,8 @@ import pytest
 from undulog.analysis.present.page import render
 from undulog.analysis.results.formats import degrees, estimate
 
+pytestmark = pytest.mark.slow
+
 TIP = "(t => t.hidden ? null : t.textContent)(document.querySelector('.tip'))"
 MARKS = """
 (() => {
@@ -57,7 +59,6 @@ def panel(page, number, section="segments"):
     return page.evaluate(MARKS.replace("PANEL", str(number)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_pointing_at_a_mark_shows_joint_value_interval_and_unit(page, snake, number):
     driven = [joint for joint in snake.joints if joint.gain.value is not None]
@@ -72,7 +73,6 @@ def test_pointing_at_a_mark_shows_joint_value_interval_and_unit(page, snake, num
     assert page.evaluate(TIP) is None
 
 
-@pytest.mark.slow
 def test_a_drag_zooms_and_the_new_ticks_are_true(page, snake):
     before = page.evaluate("document.querySelector('[aria-labelledby=segments] svg').innerHTML")
     left, top, right, bottom = panel(page, 1)["frame"]

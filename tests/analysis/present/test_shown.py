@@ -54,6 +54,7 @@ NAMES = ("snake", "still", "single", "hostile", "both ways", "kicked", "reversal
 NAMES += ("local coupling", "coupling", "sweep", "comparison")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_what_was_saved_is_read_back_equal(results, name, tmp_path):
     result = results[name]

@@ -8,6 +8,8 @@ from support.written_topics import write_topics
 from undulog.capture import Session
 from undulog.replay.recording import write_recording
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def live(session_file, tmp_path_factory, read_back):
@@ -25,7 +27,6 @@ def replay(session_file, tmp_path_factory, read_back):
     return read_back(path)
 
 
-@pytest.mark.slow
 def test_every_message_is_shown(live, session_file, opened):
     report, _ = live
     count = sum(channel.count for channel in opened(session_file).channels.values())
@@ -34,7 +35,6 @@ def test_every_message_is_shown(live, session_file, opened):
     assert report["lag_s"]["p50"] > 0
 
 
-@pytest.mark.slow
 def test_angles_and_power_are_those_that_were_measured(live, truth):
     _, drawn = live
     angle, scalar = "Angle:degrees", "Scalars:scalars"
@@ -50,7 +50,6 @@ def test_angles_and_power_are_those_that_were_measured(live, truth):
         np.testing.assert_allclose(list(found.values()), values, atol=atol)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "component"),
     [
@@ -92,7 +91,6 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     assert sum(one.is_static for one in static) == 1
 
 
-@pytest.mark.slow
 def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back, opened):
     t_ns = truth.t_ns + np.where(np.arange(len(truth.t_ns)) < 150, 0, 3_000_000_000)
     names = snake25.joint_names

@@ -25,6 +25,8 @@ from undulog.replay.overlay.sessions import Align, align, convert, read_side, ti
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
 LAG = 0.7
 
@@ -184,7 +186,6 @@ def chord(wave, step_s):
     return np.rad2deg(fastest * step_s**2 / 8) + 2e-5  # and 32 bits
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["time", "phase"])
 def test_differences_are_those_of_the_waves(beside, how):
     found, entity, joints = beside[how], "/compared/twin/angles", np.arange(len(NAMES))
@@ -203,7 +204,6 @@ def test_differences_are_those_of_the_waves(beside, how):
     assert found.static(entity, "SeriesLines:names") == list(NAMES)
 
 
-@pytest.mark.slow
 def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     """Both go the same way in worlds of their own, so by time the heads part as one slows down."""
     found = beside["time"]
@@ -282,7 +282,6 @@ def still(make, tmp_path_factory):
     return make(tmp_path_factory.mktemp("still") / "still.mcap", Wave(seconds=2.0), gait=False)
 
 
-@pytest.mark.slow
 def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make, tmp_path, command):
     back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
     none = "no phase of a gait was logged (/gait) in still; align by --align time"

@@ -146,6 +146,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_plans_that_no_computer_would_end_are_refused_by_a_sentence(name, tmp_path):
     text, why = HOSTILE[name]

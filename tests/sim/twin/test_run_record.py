@@ -11,6 +11,8 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.robot.run import RUN_RECORD
 from undulog.sim import parse_scenario, record
 
+pytestmark = pytest.mark.slow
+
 SCENARIO = f"""
 name = "changed"
 settle_s = 2.0
@@ -58,7 +60,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_the_record_states_what_the_scenario_made_of_the_robot(folder):
     robot = parse_scenario(SCENARIO, "changed.toml").robot
     described = load_robot("snake13")
@@ -79,7 +80,6 @@ def test_the_record_states_what_the_scenario_made_of_the_robot(folder):
         assert "contact_law" not in session.metadata[RUN_RECORD]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("file", ["run.mcap", "free.mcap"])
 def test_a_session_without_the_record_gives_the_same_facts(folder, file, opened):
     new, old = (opened(folder / name / file) for name in ("new", "old"))
@@ -89,7 +89,6 @@ def test_a_session_without_the_record_gives_the_same_facts(folder, file, opened)
     assert not old.warnings
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [("analyse", "run.mcap"), ("analyse", "free.mcap"), ("compare", "run.mcap", "free.mcap")],
@@ -103,7 +102,6 @@ def test_a_session_without_the_record_gives_the_same_numbers(folder, report_of, 
     assert results[0] == results[1]
 
 
-@pytest.mark.slow
 def test_every_edit_keeps_the_record(folder, tmp_path, command, report_of, opened):
     run = folder / "new" / "run.mcap"
     names = ("a.mcap", "b.mcap", "m.mcap", "r.mcap", "x.mcap")

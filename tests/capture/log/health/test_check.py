@@ -70,6 +70,7 @@ def test_json_is_one_object_and_has_whether_the_stored_verdict_differs(write, co
 # -- planted in the rhythm ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_gaps_are_counted_measured_and_placed(write):
     lost = {*range(300, 303), 900, *range(1500, 1530)}
     health = check_session(write(lost=lambda tick: tick in lost))
@@ -122,6 +123,7 @@ def test_repeated_and_backward_stamps_are_counted(write):
     assert health.verdict == "degraded"
 
 
+@pytest.mark.slow
 def test_jitter_has_the_standard_deviation_that_was_planted(write):
     late = np.random.default_rng(11).normal(0.0, 3e5, TICKS).astype(int)
 

@@ -21,6 +21,8 @@ from undulog.capture.common.remote import RemoteFile, RemotePath, as_path
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.write.durable_sink import DurableSink
 
+pytestmark = pytest.mark.slow
+
 T0 = 1_735_689_600_000_000_000
 JOINTS = tuple(f"joint{k:02d}" for k in range(1, 6))
 
@@ -263,7 +265,6 @@ def test_mutated_summaries_never_read_otherwise_than_here(chunked, tmp_path):
     assert sum(outcomes) > 20
 
 
-@pytest.mark.slow
 def test_a_url_opens_as_a_stream(session):
     data = session.read_bytes()
     with web_server(files={"run.mcap": data}) as server:
