@@ -57,11 +57,11 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 # have the tests of processes, time and pictures, and wait more than they compute. A file of one may
 # lie in a folder of another: all four shall end at about the same time.
 ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py test_standing.py) \
-  tests/analysis tests/docs
+  tests/analysis tests/capture/common tests/capture/sources tests/docs
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
   $(addprefix tests/capture/,bus judgement robot) \
-  $(addprefix tests/sim/,batch gait physics scenario twin)
+  $(addprefix tests/sim/,batch gait scenario twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
 WAITING = $(addprefix tests/analysis/,estimators experiment response) \
   $(addprefix tests/house/,test_package.py test_root_names.py) tests/replay tests/sim

@@ -12,6 +12,8 @@ from undulog.capture import load_robot
 from undulog.sim import load_scenario
 from undulog.sim.twin.recording import record
 
+pytestmark = pytest.mark.slow
+
 # What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
 LINES = [
     "record --settings {no}.toml",
@@ -87,9 +89,8 @@ KINDS = ["empty", "several", "rosbag2", "rosbag2 of sqlite3"]
 
 
 def when(number):
-    """Return the mark of a case: one of eight is fast, and one slow."""
-    tried = number % (2 * len(KINDS))
-    return {1: (), 1 + len(KINDS): pytest.mark.slow}.get(tried, pytest.mark.nightly)
+    """Return the mark of a case: one of four is for every integration."""
+    return () if number % len(KINDS) == 1 else pytest.mark.nightly
 
 
 @pytest.mark.parametrize(
@@ -136,7 +137,6 @@ def of_one(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("line", OF_ONE)
 def test_a_folder_of_one_session_is_that_session(line, of_one, tmp_path, capsys):
     words = {"folder": of_one, "out": tmp_path / "out", "run": of_one / "run.mcap"}

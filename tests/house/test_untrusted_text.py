@@ -22,6 +22,8 @@ from support.written_sessions import joint_state
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type, schema_text
 
+pytestmark = pytest.mark.slow
+
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FORGED = "FORGED good: all joints follow"
@@ -143,22 +145,14 @@ def raw(text):
     return {c for c in text if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")} - {"\n"}
 
 
-def marked(commands):
-    """Return commands as parameters; what analyses more than once, or draws, is slow."""
-    slow = ("analyse A B", "analyse A --", "compare", "report", "view")
-    return [pytest.param(x, marks=pytest.mark.slow if x.startswith(slow) else ()) for x in commands]
-
-
-@pytest.mark.parametrize("command", marked(COMMANDS))
+@pytest.mark.parametrize("command", COMMANDS)
 def test_no_command_prints_a_control_character_or_a_forged_line(run, command):
     for text in run(command, *(() if "N" in command else forced(command))):
         assert raw(text) == set()
         assert not re.search(rf"(?m)^(# )?{FORGED[:6]}", text)
 
 
-@pytest.mark.parametrize(
-    "command", marked(x for x in COMMANDS if "N" not in x and "frames" not in x)
-)
+@pytest.mark.parametrize("command", [x for x in COMMANDS if "N" not in x and "frames" not in x])
 def test_json_is_one_value_and_keeps_the_names(run, command):
     out, _ = run(command, "--json", *forced(command))
     assert raw(out) == set()
@@ -169,7 +163,6 @@ def test_json_is_one_value_and_keeps_the_names(run, command):
         assert set(value["attachments"]) == {f"a\x1b]52;c;cm0gLXJmIC8=\x07\n{FORGED}"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
@@ -225,7 +218,6 @@ class _Tags(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", ["report A -o p.html", "report A B -o q.html", "compare A B -o r.html"]
 )

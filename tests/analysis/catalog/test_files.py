@@ -71,15 +71,12 @@ DAMAGES = {
 }
 
 
-FAST = {("empty", "analyses")}
-SLOW = {("flipped", "sessions")}
+TRIED = {("empty", "analyses"), ("flipped", "sessions")}
 
 
 def when(damage, kind):
     """Return the mark of a damage: two of them are tried in every integration."""
-    if (damage, kind) in FAST:
-        return ()
-    return pytest.mark.slow if (damage, kind) in SLOW else pytest.mark.nightly
+    return () if (damage, kind) in TRIED else pytest.mark.nightly
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from support.resting import STEP, Joint, found_in, play
 from undulog.analysis.dead_band.find import fundamental_change, rested
 
+pytestmark = pytest.mark.slow
+
 JOINTS = 6
 
 
@@ -120,7 +122,6 @@ def test_a_clipped_sensor_has_none():
     assert found == {}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("witness", "kind"),
     [

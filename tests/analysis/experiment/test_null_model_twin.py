@@ -50,3 +50,19 @@ def test_from_the_twin_to_a_named_module(tmp_path, capsys, command):
     low, high = weak["modules"][2]["relative"]["stall_torque"]["ci95"]
     assert low < -0.2 < high  # it has the truth, though it is wide: the model's own error is in it
     assert "can't be held to" in analysed(wave(0.8, 0.25))
+
+
+@pytest.mark.nightly
+def test_each_inner_joint_of_a_plane_of_six_is_named_at_half_its_torque(tmp_path, command):
+    """Of so few joints the body's own profile is as large as what a weak one makes of it."""
+    (tmp_path / "chain.toml").write_text(twin_chains.chain(11))
+    scenario, model, session = (tmp_path / name for name in ("w.toml", "null.json", "run.mcap"))
+    scenario.write_text(wave(1.0, 0.5))
+    command("sim", "null", scenario, "-o", model)
+    named = {}
+    for joint in ("joint03", "joint05", "joint07", "joint09"):
+        scenario.write_text(wave(1.0, 0.5, servo_of={joint: {"stall_torque": 0.25}}))
+        command("sim", "run", scenario, "-o", session, "--kernels", "numba", "--force")
+        report = json.loads(command("analyse", session, "--null", model, "--json").out)
+        named[joint] = report["null_model"]["named"]
+    assert named == {joint: [joint] for joint in named}

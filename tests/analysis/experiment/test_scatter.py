@@ -14,6 +14,8 @@ from undulog.analysis.experiment.kick_runs import Kick, Kind, sort_kicks
 from undulog.analysis.experiment.local_coupling import local_matrices
 from undulog.analysis.experiment.run_scatter import run_errors
 
+pytestmark = pytest.mark.slow
+
 H, C = kick_tables.chain(5)
 KICKS = kick_tables.plan(5)
 

@@ -13,6 +13,8 @@ from undulog.capture import Session, load_robot
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Plane
 
+pytestmark = pytest.mark.slow
+
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
 BASE = 0.3 * np.exp(-1j * np.pi / 3 * np.arange(4) + 0.7j)
@@ -119,7 +121,6 @@ def test_what_is_refused(like, tmp_path, command):
     assert "exists" in command(*words, *short, code=2).err
 
 
-@pytest.mark.slow
 def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, command):
     words = ("plan", "phase-kicks", "--like", like, "--settle", "1", "--measure", "1", "-o")
     (tmp_path / "file").write_text("")
@@ -205,7 +206,6 @@ def test_two_rods_have_their_textbook_inertia():
     np.testing.assert_allclose(inertia, [[0.2 * 0.3**2 / 24]], rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_sweeps_that_are_refused(like, tmp_path, command):
     words = ["plan", "lag-sweep", "--like", str(like), "-o", str(tmp_path / "x")]
     assert "would saturate" in command(*words, "--amplitude", "0.2", code=2).err
@@ -222,7 +222,6 @@ LIMITS = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("plan", ["phase-kicks", "reversal", "lag-sweep", "multisine"])
 @pytest.mark.parametrize("limit", LIMITS)
 def test_commands_faster_than_a_joint_are_refused(plan, limit, tmp_path, command):

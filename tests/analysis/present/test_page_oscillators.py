@@ -13,6 +13,8 @@ from undulog.analysis.present.page import render
 from undulog.analysis.present.session_view import chain_view
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
+pytestmark = pytest.mark.slow
+
 LINKS = (
     Link("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6))),
     Link("b", "a", Estimate(0.01, (0.0, 0.06)), Estimate()),

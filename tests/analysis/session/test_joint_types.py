@@ -16,6 +16,8 @@ from support.ros_bags import (
     write_bag,
 )
 
+pytestmark = pytest.mark.slow
+
 fill_controller = filling(Filler.controller)
 
 
@@ -69,7 +71,6 @@ def test_the_response_comes_out_of_each_type(kind, storage, tmp_path, report_of)
     assert "--command-topic and --response-topic" in found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("version", ["foxy", "galactic", "humble", "iron", "jazzy"])
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_every_release_of_the_controller_state(version, storage, tmp_path, report_of):

@@ -11,6 +11,8 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 
+pytestmark = pytest.mark.slow
+
 EPOCH_NS = 1_735_689_600_000_000_000
 TICK_NS = 10_000_000
 OMEGA = np.pi  # 0.5 Hz: 200 ticks a cycle
@@ -172,7 +174,6 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     assert found.startswith("electrical energy is 300 J from the samples but 240 J")
 
 
-@pytest.mark.slow
 def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, result):
     assert result.energy.unknown == (
         "mechanical energies are products of sampled torque and velocity and electrical energies "
@@ -193,7 +194,6 @@ def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_p
     assert [joint.energy_el_clipped_j for joint in result.joints] == pytest.approx([21.0] * 25)
 
 
-@pytest.mark.slow
 def test_a_change_of_gait_splits_the_session(tmp_path):
     path = write_twin(tmp_path / "two.mcap", duration=22.0, change=1000, odometry=False)
     result = analysed(path)
@@ -243,7 +243,6 @@ def test_the_first_line_is_the_answer_and_the_last_the_method(twin, command):
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])
 
 
-@pytest.mark.slow
 def test_files_and_options_of_the_verb(twin, tmp_path, command):
     out = tmp_path / "result.json"
     assert f"Result: {out}" in command("analyse", twin, twin, "-o", out).out

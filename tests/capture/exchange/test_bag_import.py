@@ -26,6 +26,8 @@ from undulog.capture.common.errors import UndulogError
 from undulog.capture.exchange import bag_import
 from undulog.capture.exchange.bag_import import import_bag
 
+pytestmark = pytest.mark.slow
+
 KINDS = {
     "bag": ("a.bag", None),
     "db3": ("a", StoragePlugin.SQLITE3),
@@ -91,7 +93,6 @@ def test_the_same_bag_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "x.mcap").read_bytes() == (tmp_path / "y.mcap").read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_response_of_an_import_is_that_of_the_bag(kind, tmp_path, report_of):
     name, storage = KINDS[kind]
@@ -187,7 +188,6 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
             np.testing.assert_array_equal(first.t_ns, second.t_ns)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bag", "mcap", pytest.param("db3", marks=pytest.mark.nightly)])
 def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypatch):
     def write(own, *tick):

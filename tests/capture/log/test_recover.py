@@ -27,6 +27,8 @@ from undulog.capture.log.cut import cut_log, recover_log, recovered_path
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.merge import merge_logs
 
+pytestmark = pytest.mark.slow
+
 
 def fingerprint(folder):
     """Every file below a folder and its bytes."""
@@ -90,7 +92,6 @@ def test_a_killed_session_reads_as_if_it_had_been_closed(path, run, split_size, 
         assert sum(len(list(session.messages(topic))) for topic in session.channels) == total
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kills", [10, pytest.param(30, marks=pytest.mark.nightly)])
 def test_kills_lose_no_accepted_message(kills, tmp_path):
     rng = random.Random(5)
@@ -234,7 +235,6 @@ def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, path, lef
         assert session.session_id == "killed"
 
 
-@pytest.mark.slow
 def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
     """Power is lost: of the file's last chunks, which were not synced, only some is there."""
     unfinished(path, 4000, segment_size=8 << 20)  # nothing released
@@ -249,7 +249,6 @@ def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
         assert any("none is missing" in text for text in warnings)
 
 
-@pytest.mark.slow
 def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(path):
     unfinished(path, 8000, segment_size=16 << 20)
     part = unfinished_path(path)

@@ -15,6 +15,8 @@ from undulog.capture import SessionWriter
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.chunk import walk_records
 
+pytestmark = pytest.mark.slow
+
 
 def flip(data, at_byte):
     data[at_byte] ^= 0x10

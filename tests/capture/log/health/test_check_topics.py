@@ -4,6 +4,8 @@ import pytest
 
 from support.ros_bags import Filler, answered, commanded, ticks, write_bag
 
+pytestmark = pytest.mark.slow
+
 CHOSEN = ("--command-topic", "/arm/goal", "--response-topic", "/arm/encoders")
 
 
