@@ -126,7 +126,8 @@ def _wraps(motion: JointMotion) -> str:
     if not 2 <= large.size <= step.size * FEW:
         return ""
     turn = float(np.median(np.abs(large)))
-    confined = samples.range < turn / FULL  # a counter stays within one turn
+    # A counter wraps after half a turn of a shaft at least, and stays within one turn of its own.
+    confined = FULL * max(np.pi, samples.range) < turn
     near = np.abs(np.abs(large) / turn - 1) < 1 - FULL
     balance = abs(float(np.sum(np.sign(large))))
     if not confined or np.mean(near) < FOLLOWS or balance > max(1.0, large.size * FEW):
