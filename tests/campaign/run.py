@@ -76,9 +76,9 @@ def mutated(seed, stage, part="mutated"):
 
 PARTS = {
     "contention": Part(contention.run, 6, 1, alone=True),
-    "gate": Part(gate.run, 40, 2, alone=True),
+    "gate": Part(gate.run, 40, 1, alone=True),
     "interruptions": Part(interruptions.run, 60, 1),
-    "interruptions_drive": Part(interruptions_drive.run, 40, 2, alone=True),
+    "interruptions_drive": Part(interruptions_drive.run, 40, 1, alone=True),
     "servers": Part(servers.run, 60, 5),
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 6),

@@ -136,7 +136,7 @@ def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, t
     assert received.static("/session", "TextDocument:text")[0].startswith("**")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "late", [pytest.param("heat_from_s", marks=pytest.mark.nightly), "last_from_s"]
 )

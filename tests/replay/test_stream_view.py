@@ -184,6 +184,7 @@ def processor_ticks(pid):
     return int(fields[11]) + int(fields[12])
 
 
+@pytest.mark.nightly
 def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(shown):
     viewer, pid = viewer_of(shown), shown.process.pid
     freeze(viewer)

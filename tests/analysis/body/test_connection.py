@@ -16,7 +16,7 @@ from undulog.analysis.experiment.body_connection import (
 )
 from undulog.capture.common.errors import DataError
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 PHASES = 2 * np.pi * np.arange(24) / 24
 SWIMMER = Swimmer()
@@ -48,7 +48,6 @@ def test_the_connection_is_that_of_force_and_moment_balance(known, seed):
     assert np.all(np.sqrt(np.mean((value - expected) ** 2, axis=0))[0] < 0.1 * size[0])
 
 
-@pytest.mark.nightly
 def test_errors_fall_with_the_size_of_the_perturbations():
     def error(size):
         model = fit_connection(cycles(16, size))
@@ -78,7 +77,6 @@ def test_speed_and_phase_of_a_gait_do_not_matter(known):
     np.testing.assert_allclose(one.predict(shape)[0], other.predict(shape * shift)[0], rtol=1e-6)
 
 
-@pytest.mark.nightly
 def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(known):
     def at(k, frequency):
         return GaitSession(f"{k}", dataclasses.replace(known[k], omega=2 * np.pi * frequency))
@@ -98,7 +96,6 @@ def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(known):
     assert "inertia is not in the model" in found.predicted[5].why
 
 
-@pytest.mark.nightly
 def test_an_experiment_with_a_model_is_saved_and_loaded(known, both_ways, tmp_path):
     body, _ = body_connection([GaitSession(f"{k}", one) for k, one in enumerate(known[:9])])
     assert body.A
@@ -150,7 +147,6 @@ def test_repeats_of_one_gait_are_refused(known):
         fit_connection(noisy)
 
 
-@pytest.mark.nightly
 def test_a_reversed_wave_is_another_gait(known):
     reverse = SWIMMER.cycle(known[0].shape[::-1])
     off = distances([*known, reverse])

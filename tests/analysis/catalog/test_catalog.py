@@ -150,7 +150,7 @@ def test_only_new_and_changed_files_are_read(lab, monkeypatch):
     assert "day1/gait.mcap" in Catalog(str(lab)).find().path.to_list()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, analysed):
     _, result = analysed
     (lab / "day1" / "gait.json").unlink()
@@ -167,7 +167,7 @@ def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, an
     assert catalog.find("path = 'day1/gait.mcap'").status.to_list() == ["not analysed"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_session_that_can_t_be_analysed_has_its_reason(tmp_path):
     write_foreign(tmp_path / "text.mcap", [("/a", 1, {"data": "x"})], "std_msgs/msg/String")
     (tmp_path / "other").mkdir()
@@ -273,7 +273,7 @@ def test_the_serial_number_is_that_of_the_description_or_of_the_metadata(tmp_pat
     assert len(catalog.find("serial = '0007'")) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(lab):
     catalog = Catalog(str(lab))
     catalog.scan()

@@ -74,7 +74,7 @@ def test_page_and_paper_together(chromium, tmp_path, report_of):
     assert sorted(tmp_path.iterdir()) == [html, pdf]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_browser_asks_no_network(chromium, tmp_path, command):
     log = tmp_path / "net.json"
     with_log = script(tmp_path, f'exec {chromium} --log-net-log={log} "$@"')

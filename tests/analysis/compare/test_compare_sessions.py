@@ -70,7 +70,7 @@ def test_the_weakened_joint_is_named_with_its_true_difference(write):
     assert any("one session a side" in warning for warning in result.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mean_cycles_differ_as_in_closed_form(write, wave):
     result = compared(write("a", 3), write("b", 4, late_s=0.2, change=weaken))
     before, after = (wave(np.random.default_rng(11), joints=5) for _ in range(2))
@@ -132,7 +132,7 @@ def test_another_gait_is_refused_or_labelled(write):
     assert result.answer.endswith("(partial comparison)")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_amplitude_of_one_joint_is_another_gait(write):
     def louder(truth):
         truth.amplitude[3] *= 1.05
@@ -180,7 +180,7 @@ def test_a_page_is_not_replaced_unasked(write, tmp_path, command):
     assert page.read_text() == "mine"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_groups_by_the_command_line(write, tmp_path, command, report_of):
     a = [write(f"a{k}", 20 + k, late_s=0.1 * k) for k in range(4)]
     b = [write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken) for k in range(4)]

@@ -7,7 +7,7 @@ from scipy import signal
 from support.joint_runs import EPOCH_NS, turns, write_joints
 from undulog.capture import Session
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 RATE_HZ = 100
 NAMES = ("a", "b")
@@ -77,7 +77,6 @@ def exact_response(found):
     return signal.freqz(*FILTER, worN=hz, fs=RATE_HZ)[1]
 
 
-@pytest.mark.nightly
 def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command):
     files = drive(planned("--realisations", 4), tmp_path)
     result = report_of("analyse", *files)
@@ -101,7 +100,6 @@ def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command)
     assert "Dashed: standard deviation" in page.read_text()
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("order", ["odd", "even"])
 def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
     bent = {"cube": 2.5} if order == "odd" else {"square": 1.0}
@@ -117,7 +115,6 @@ def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
         assert one["distortion"]["value"] < 0.01  # a square makes no odd lines of odd lines
 
 
-@pytest.mark.nightly
 def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_path, report_of):
     files = drive(planned("--realisations", 3, "--runs", 2), tmp_path, cube=2.5, record={})
     best = report_of("analyse", *files, "--start", 4)["best_linear"]
@@ -125,7 +122,6 @@ def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_p
     assert best["joints"][0]["distortion"]["value"] > 0.02
 
 
-@pytest.mark.nightly
 def test_orthogonal_commands_give_the_response_to_each_other_joint(planned, tmp_path, report_of):
     mix = np.array([[1.0, 0.3], [-0.2, 0.8]])
     files = drive(planned("--realisations", 2, "--inputs", "orthogonal"), tmp_path, mix=mix)
@@ -156,7 +152,6 @@ def test_one_period_or_realisation_separates_nothing(words, what, planned, tmp_p
     assert any(warning.startswith(what) for warning in result["warnings"])
 
 
-@pytest.mark.nightly
 def test_a_copy_and_a_wrong_record_are_named(planned, tmp_path, report_of, command):
     plans = planned("--realisations", 2)
     files = drive(plans, tmp_path)

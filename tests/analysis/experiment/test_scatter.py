@@ -14,7 +14,7 @@ from undulog.analysis.experiment.kick_runs import Kick, Kind, sort_kicks
 from undulog.analysis.experiment.local_coupling import local_matrices
 from undulog.analysis.experiment.run_scatter import run_errors
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 H, C = kick_tables.chain(5)
 KICKS = kick_tables.plan(5)
@@ -47,13 +47,11 @@ def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs
     assert found["half"] <= 1.5 * 1.96 * math.sqrt(2) * sigma / (2 * kick_tables.KICK)
 
 
-@pytest.mark.nightly
 def test_without_coupling_the_headline_shows_none():
     found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
     assert found["headline"] <= 0.05
 
 
-@pytest.mark.nightly
 def test_nonlinearity_is_still_found():
     """A servo whose gain falls with amplitude, 14 % nonlinear, under scatter of 0.03 degrees."""
     random = np.random.default_rng(5)

@@ -64,7 +64,7 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, command):
     text = command("analyse", slither).out
     # 3 x 0.954 Hz - 1.432 Hz falls within 1.5/T of 1.432 Hz.

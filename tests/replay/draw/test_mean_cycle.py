@@ -154,7 +154,7 @@ def test_joints_with_a_false_sensor_are_left_out(
     assert {len(row) for row in shapes} == {9}  # the links before the joint
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_was_kept_stretch_by_stretch_is_what_is_read_at_once(twin, monkeypatch):
     monkeypatch.setattr(timeline, "STRETCH_NS", 10**9)
     with Session.open(twin[0]) as session:

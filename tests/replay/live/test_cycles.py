@@ -144,7 +144,7 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
             np.testing.assert_allclose(np.ravel(heights).astype(float), own, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back, opened):
     """A recorder of the twin in real time, and a relay: two processes."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}

@@ -44,7 +44,7 @@ def reference(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path, command, report_of):
     frame = pd.read_parquet(reference / "rows" / "rows")
     row = frame[(frame["servo.stall_torque"] == 0.2) & (frame.seed == 1)].iloc[0]

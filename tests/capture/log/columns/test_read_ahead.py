@@ -244,7 +244,7 @@ print(status("VmHWM") - before - sum(arrays.values()) - path.stat().st_size)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.nightly), 4])
 def test_beyond_the_arrays_and_the_file_a_reader_needs_little(tmp_path, threads):
