@@ -4,6 +4,8 @@ import pytest
 
 from undulog.analysis.present.page import render
 
+pytestmark = pytest.mark.slow
+
 PAGE_PX = (297 - 2 * 14) * 96 / 25.4
 """Height of an A4 page within its margins, in CSS pixels."""
 

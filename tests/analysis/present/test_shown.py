@@ -15,6 +15,8 @@ from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 
+pytestmark = pytest.mark.slow
+
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -54,7 +56,6 @@ NAMES = ("snake", "still", "single", "hostile", "both ways", "kicked", "reversal
 NAMES += ("local coupling", "coupling", "sweep", "comparison")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_what_was_saved_is_read_back_equal(results, name, tmp_path):
     result = results[name]
@@ -140,7 +141,6 @@ def test_a_coupling_is_one_row_a_pair(kicked):
     np.testing.assert_allclose(frame["P"].groupby("joint").sum(), totals)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pictures"),
     [
@@ -173,7 +173,6 @@ def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path
         result.plot("nonsense")
 
 
-@pytest.mark.slow
 def test_two_figures_on_one_page_share_no_identifier(snake):
     first, second = (snake.plot()._repr_html_() for _ in range(2))
     ids = [{part.split('"')[0] for part in one.split(' id="')[1:]} for one in (first, second)]

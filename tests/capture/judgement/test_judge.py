@@ -65,8 +65,9 @@ def jam(chain, at_s=7.4):
 
 @pytest.mark.parametrize("joints", [1, 2, 4, 9, pytest.param(40, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("step", [-np.pi / 3, 0.0])
-def test_sound_joints_are_not_named(joints, step):
-    for seed in range(5):
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 5), marks=pytest.mark.nightly)])
+def test_sound_joints_are_not_named(joints, step, seeds):
+    for seed in seeds:
         assert Chain(joints, seed, step).judged("velocity", "effort", "second") == {}
 
 
@@ -110,7 +111,7 @@ def test_a_joint_that_is_dragged_may_be_dead_or_scaled(chain):
     assert set(chain.judged()["j4"].kinds) >= {"dead", "scaled_sensor"}
 
 
-@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 20), marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 20), marks=pytest.mark.nightly)])
 def test_a_noisy_coarse_encoder_repeats_values_by_chance(seeds):
     for seed in seeds:
         assert coarse(seed).judged() == {}
