@@ -57,7 +57,7 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 # have the tests of processes, time and pictures, and wait more than they compute. A file of one may
 # lie in a folder of another: all four shall end at about the same time.
 ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py test_standing.py) \
-  tests/analysis tests/capture/common tests/capture/sources tests/docs
+  tests/analysis tests/capture/sources tests/docs
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
   $(addprefix tests/capture/,bus judgement robot) \
