@@ -72,7 +72,8 @@ class NullTest:
         deviation: ln(value / shared value) of each module's own parameters, shape (m, q).
         error: Standard errors, shape (m, q).
         critical: Factor on ``error`` that makes all m q intervals hold together at 95 %.
-        named: Indices of the modules that deviate, the clearest first.
+        named: Indices of the modules that deviate, the clearest first; none after one that deviates
+            in a shared parameter by more than twice its reach, as its effect isn't linear.
         rest_p: p-value of what is left when the named ones deviate.
     """
 
@@ -128,6 +129,8 @@ def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTes
     named: tuple[int, ...] = ()
     p = np.ones(len(kinds))
     whole: tuple[FloatArray, FloatArray] | None = None
+    beyond_reach, reaches = False, {one.name: one.reach for one in model.parameters}
+    reach = np.array([reaches.get(kind, np.inf) for kind in model.modules])
     while True:
         x, system = _linear(np.log(response.ratio), variance, joints, model, named)
         drawn = _draws(system, np.tile(response.dof, 2), np.random.default_rng(1))
@@ -138,9 +141,11 @@ def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTes
         others = [j for j in range(len(kinds)) if j not in named]
         p[others] = _share(noise_gain[:, others].max(axis=1)[:, None], gain[others])
         best = others[int(np.argmax(gain[others]))]
-        if p[best] >= SIGNIFICANT or len(named) + 1 >= most:
+        if p[best] >= SIGNIFICANT or len(named) + 1 >= most or beyond_reach:
             break
         named = (*named, best)
+        # Of a deviation far beyond the model's reach it leaves what isn't linear to other modules.
+        beyond_reach = bool(np.any(np.abs(deviation[best]) > 2 * reach))
     score = np.abs(noise_deviation / noise_error).max(axis=(1, 2))
     design = system.beside(named)
     information = np.linalg.inv(design.T @ design)
