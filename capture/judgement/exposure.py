@@ -27,6 +27,10 @@ from .levels import (
 from .motion import Course, JointMotion
 from .response import SETTLED, Filtered, Response
 
+LIKE_LAG_S = 0.05
+"""Difference in lag up to which joints may be of one kind [s]: two control periods of a slow bus
+(40 Hz)."""
+
 
 @dataclass(frozen=True)
 class Exposure:
@@ -136,11 +140,6 @@ def agrees(response: Response, common: Response) -> bool:
     return abs(response.gain / common.gain - 1) < QUARTER and (
         abs(response.lag_s - common.lag_s) < max(QUARTER * common.lag_s, LIKE_LAG_S)
     )
-
-
-LIKE_LAG_S = 0.05
-"""Difference in lag up to which joints may be of one kind [s]: two control periods of a slow bus
-(40 Hz)."""
 
 
 def median_response(responses: Sequence[Response]) -> Response:
