@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
+from undulog.capture.common.errors import some_names
 from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
 from undulog.capture.judgement.naming import NAMED
 
@@ -213,14 +214,9 @@ def _left_out(facts: Facts) -> str:
     rest = [name for name in names if name not in asked] if facts.findings.compared else []
     most = math.degrees(max(asked.values(), default=0.0))
     little = f"not asked to move enough to judge (at most {most:.2g} degrees commanded)"
-    sentences = [f"{_listed([*asked])}: {little}."] if asked else []
-    sentences += [f"Not compared: {_listed(rest)}."] if rest else []
+    sentences = [f"{some_names([*map(plain, asked)], NAMED)}: {little}."] if asked else []
+    sentences += [f"Not compared: {some_names([*map(plain, rest)], NAMED)}."] if rest else []
     return " ".join(sentences)
-
-
-def _listed(names: Sequence[str]) -> str:
-    listed = ", ".join(plain(name) for name in names[:NAMED])
-    return listed + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 def _scales(facts: Facts) -> str:

@@ -56,6 +56,8 @@ INFORMED = 1 - FULL
 NOISE_MARGIN = float(np.log(2.0))
 """Logarithm of the ratio of noise that matters: twice as much."""
 
+EPS = float(np.finfo(np.float64).eps)
+
 QUANTITIES = ("offset", "gain", "lag", "noise")
 TERMS = len(QUANTITIES) - 1  # of the regression
 
@@ -218,7 +220,7 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         values[:TERMS, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
         lost[k] = REST_ERRORS * _middle(scatter[weights[TERMS, k] > 0])
         # Below the usual noise no change is of interest.
-        values[TERMS, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2) + TINY)
+        values[TERMS, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2) + EPS)
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
     swept = tuple(is_sweep(command) for command in course.command)
     return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
@@ -262,7 +264,7 @@ def _regressed(
     scaled = gram / scale[:, None] / scale[None, :]
     # A block without motion knows its offset only: the ridge keeps the rest at 0, weightless.
     ridge = np.full(TERMS, RIDGE)
-    ridge[0] = np.finfo(np.float64).eps
+    ridge[0] = EPS
     inverse = np.linalg.inv(scaled + np.diag(ridge))
     inverse /= scale[:, None] * scale[None, :]
     estimate = np.einsum("bij,bj->bi", inverse, target)
