@@ -25,7 +25,7 @@ def test_the_page_has_the_usual_fifteen():
     assert len(COMMANDS) >= 15
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.line)
 def test_the_message_is_as_shown(command, folder, monkeypatch, capsys):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))

@@ -42,7 +42,7 @@ def test_every_command_is_of_undulog_or_a_shell(name):
         assert line.split()[0] in {"undulog", "sed", "mkdir", "for"}, line
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=when(name)) for name in PAGES],

@@ -73,7 +73,7 @@ def test_that_sees_it_late_each_time():
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_only_a_late_computer_is_a_reason_to_run_a_test_again(tmp_path, monkeypatch):
     (tmp_path / "test_one.py").write_text(TESTS)
     (tmp_path / "conftest.py").write_text(
@@ -146,7 +146,7 @@ load.communicate("\\n")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processor_times_are_told_apart_by_who_began_the_processes(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"))
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

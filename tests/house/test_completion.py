@@ -28,7 +28,7 @@ def home(tmp_path_factory):
     return home
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

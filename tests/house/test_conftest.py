@@ -75,14 +75,14 @@ def test_afterwards():
 MARKED = """
 import pytest
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slow(): pass
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.built("part")
 def test_built(): pass
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.nightly
 def test_nightly(): pass
 """
@@ -106,7 +106,7 @@ def running(folder):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("variable", "wanted"),
     [("", {"slow"}), ("BUILD_PAGES", {"slow", "built"}), ("NIGHTLY", {"slow", "nightly"})],
@@ -120,7 +120,7 @@ def test_a_marker_leaves_its_tests_to_their_target(tmp_path, variable, wanted):
     assert set(re.findall(r"::test_(\w+)", done.stdout)) == wanted, done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("test", ["waits_for_ever", "holds_the_interpreter"])
 def test_a_test_that_stands_still_ends_the_run_with_all_stacks(tmp_path, test):
     copy_conftest(tmp_path)
@@ -137,7 +137,7 @@ def test_a_test_that_stands_still_ends_the_run_with_all_stacks(tmp_path, test):
     wait_for(lambda: running(tmp_path) == [], "all processes to end")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_limit_of_zero_is_none(tmp_path):
     copy_conftest(tmp_path)
     (tmp_path / "test_one.py").write_text("import time\ndef test_long(): time.sleep(5)\n")
@@ -146,7 +146,7 @@ def test_a_limit_of_zero_is_none(tmp_path):
     assert "1 passed" in done.stdout, done
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_failed_test_ends_its_processes_where_signals_are_ignored(tmp_path):
     copy_conftest(tmp_path)
     (tmp_path / "test_two.py").write_text(TESTS)

@@ -44,7 +44,7 @@ LAYOUT = {
 """Packages that parse a command line and lay out help."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_help_imports_a_package_besides_those_that_lay_it_out():
     # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
     groups = {verb.split()[0] for verb in undulog.VERBS}
@@ -102,7 +102,7 @@ def test_a_missing_argument_exits_2(command):
     assert "FILE" in command("log", "info", code=2).err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_missing_extra_is_named():
     # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
     code = (

@@ -149,7 +149,7 @@ def _imports(tree):
     return names
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_file_names_a_package_without_undulog_or_its_own_package_with_it():
     found = []
     for path in tracked("*.py"):

@@ -34,7 +34,7 @@ def test_public_names_are_these_and_can_be_imported(package):
     assert all(hasattr(module, name) for name in module.__all__)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_examples_in_docstrings_import_what_exists():
     lines = [
         (path, line.strip())

@@ -82,7 +82,7 @@ def test_changes_are_for_a_scenario_that_is_named(tmp_path):
         undulog.record(undulog.load_scenario("flat"), tmp_path / "x.mcap", changes={"seed": 2})
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_strangers_program_is_typed_by_the_installed_wheel(tmp_path):
     build = (sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
     assert processes.run(*build, cwd=ROOT).returncode == 0

@@ -179,7 +179,7 @@ def shared(one, other):
     return (one & other).sum() / (one | other).sum()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, command, tmp_path):
     part = ("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360")
     found = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
@@ -198,7 +198,7 @@ def test_without_a_vulkan_driver_the_packages_are_named(session_file, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ctrl_c_leaves_nothing_behind(session_file, vulkan, tmp_path):
     scratch = tmp_path / "scratch"
     scratch.mkdir()

@@ -46,7 +46,7 @@ def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, r
     assert report_of("compare", recorded, path) == report["comparison"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_early_end_is_reported_and_nothing_is_compared(recorded, tmp_path, command):
     words = ("replay", recorded, "--arm", "-o", tmp_path / "again.mcap", "--on")
     with served("weak-servo-pi3", "--fault", "lost:joint07:1@2") as on:

@@ -259,7 +259,7 @@ needs_recordings = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recording
 
 
 @needs_recordings
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_manual_says_what_is_stated_of_recordings():
     page = (DOCS / "explanation/faults.md").read_text()
     assert "\n".join(recorded_page.lines()) in page, "renew it: python -m zoo.recorded_page"

@@ -83,7 +83,7 @@ def test_an_offset_of_some_joints_is_no_serpenoid():
     assert plane.serpenoid.offset_rad.value == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_cover_what_noise_does():
     hits = []
     for seed in range(40):

@@ -50,6 +50,7 @@ def bags(tmp_path):
 SESSIONS = ["tool/deep/run.mcap", "tool/run.mcap"]
 
 
+@pytest.mark.nightly
 def test_bags_are_rows_with_the_facts_of_their_sessions(bags):
     catalog = Catalog(str(bags))
     report = catalog.scan()

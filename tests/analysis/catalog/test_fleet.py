@@ -13,7 +13,7 @@ from undulog.analysis.catalog.catalog import Catalog
 from undulog.analysis.catalog.change_points import Judged
 from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 DAY_NS = 86_400_000_000_000
 FIRST = pd.Timestamp("2026-09-01")

@@ -50,7 +50,7 @@ def short(tmp_path_factory):
     return write_run(tmp_path_factory.mktemp("short") / "run.mcap", WAVE, CHAIN @ WAVE, 1, 0.003)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_session_on_paper(chromium, tmp_path, command):
     pdf = tmp_path / "run.pdf"
     printed = command("report", GOLDEN, "--pdf", pdf).out.splitlines()

@@ -79,7 +79,7 @@ def test_false_alarms_of_any_motion(amplitudes):
     assert false_alarms(amplitudes, 150) <= 0.05 + 3 * (0.05 * 0.95 / 150) ** 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_intervals_hold_the_planted_differences():
     change = np.array([1, 1.05, 1, 1, np.exp(-1j * np.radians(3)), 1])
     held, named = 0, 0
@@ -225,7 +225,7 @@ def test_groups_and_pairs_by_the_command_line(write, tmp_path, command, report_o
     assert "a copy is not a run of its own" in err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_commands_on_one_side_only_are_refused(write):
     a, b = write("a", 40), write("b", 41, commands=True)
     with pytest.raises(DataError, match=r"a\.mcap has no logged commands, b\.mcap has"):

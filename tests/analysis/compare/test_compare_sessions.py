@@ -122,7 +122,7 @@ def test_energy_alone_may_differ(write):
     assert ratios == pytest.approx([0.2] * 5, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_gait_is_refused_or_labelled(write):
     a, b = write("a", 12), write("b", 13, frequency=1.1)
     with pytest.raises(DataError, match=r"the gaits differ, .* b.mcap has 1.1 Hz, a.mcap 0.97 Hz"):
@@ -141,7 +141,7 @@ def test_another_amplitude_of_one_joint_is_another_gait(write):
         compared(write("a", 14), write("b", 15, change=louder))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_other_joints_are_left_out_or_refused(write):
     a = write("a", 16)
     result = compared(a, write("b", 17, joints=4))
@@ -150,7 +150,7 @@ def test_other_joints_are_left_out_or_refused(write):
         compared(a, write("c", 18, first=11))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, command):
     page = tmp_path / "page.html"
     files = [str(write("a", 1)), str(write("b", 2, change=weaken))]

@@ -122,6 +122,7 @@ def test_a_clipped_sensor_has_none():
     assert found == {}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("witness", "kind"),
     [

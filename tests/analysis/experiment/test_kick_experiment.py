@@ -15,7 +15,7 @@ from support.linear_chain import M, asymmetry, within
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LocalCoupling
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 H, BASE = kick_tables.chain(M)
 TRUTH = H * BASE[None, :] / (H @ BASE)[:, None]

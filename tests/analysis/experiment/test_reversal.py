@@ -129,7 +129,7 @@ def test_identical_modules_are_called_different_in_one_experiment_of_twenty(nois
     assert heterogeneity_tables.false_positives(5, **noise) == pytest.approx(0.05, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("size", [1.0, 3.0, 5.0, 9.0])
 def test_a_weak_module_is_found_and_named(size):
     """One module of 13 with more lag; ``size`` in standard errors of d: sqrt(2/6) of a run's.

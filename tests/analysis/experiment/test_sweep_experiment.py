@@ -15,7 +15,7 @@ from undulog.analysis.results.coupling import LinearCoupling, Route
 from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]

@@ -127,7 +127,7 @@ def test_what_is_left_of_a_kick_has_an_interval():
     assert np.mean(inside) >= 0.91
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_limits_are_stated():
     coupling = measured()[2]
     known = dataclasses.replace(coupling, valid_to=0.1)
@@ -176,7 +176,7 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, repo
     command(*words, "--force")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -191,14 +191,14 @@ def test_wrong_usage(result, words, code, message, command):
     assert message in command("predict", result[0], *words.split(), code=code).err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):
     words = ("predict", result[1][0], "--eps", "0.3")
     assert "phase-kicks around this gait" in command(*words, code=1).err
     command("predict", code=2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_result_of_kicks_reads_back(result):
     from undulog.analysis import load
 

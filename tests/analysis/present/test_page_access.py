@@ -47,7 +47,7 @@ def nodes(browser):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     browser.open(address)
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
@@ -74,7 +74,7 @@ def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     assert roles["rowheader"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_figures_have_name_and_description(browser, address):
     browser.open(address)
     found = nodes(browser)
@@ -98,7 +98,7 @@ BEYOND = """
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_on_paper_nothing_is_cut(browser, address):
     browser.open(address, width=int(PORTRAIT_PX), media="print")
     assert browser.evaluate(BEYOND) == []

@@ -27,7 +27,7 @@ def test_it_prints_the_answer_and_writes_the_page(page, recorded, command):
     assert list(page.parent.iterdir()) == [page], "no half-written file is left"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_json_names_page_and_answer_and_the_page_is_the_same(page, recorded, tmp_path, report_of):
     again = tmp_path / "run.html"
     result = report_of("report", recorded, "-o", again)
@@ -81,7 +81,7 @@ def test_a_missing_session_exits_1_and_leaves_nothing(tmp_path, command):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_real_ramp_gets_its_page_without_invented_numbers(tmp_path, command):
     if not REAL.is_file():
         pytest.skip(f"no real recording at {REAL}")

@@ -19,7 +19,7 @@ from undulog.analysis.results.body import BodyConnection, PredictedTravel
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.formats import sentence
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 @pytest.fixture(scope="module")

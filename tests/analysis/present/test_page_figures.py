@@ -9,7 +9,7 @@ import pytest
 from undulog.analysis.present.page import render
 from undulog.analysis.results.formats import degrees, estimate
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 TIP = "(t => t.hidden ? null : t.textContent)(document.querySelector('.tip'))"
 MARKS = """

@@ -41,7 +41,7 @@ def assert_no_placeholders(path):
     assert not {*map(tuple, seen)} & {*SENTINELS}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["svg", pytest.param("png", marks=pytest.mark.nightly)])
 def test_each_figure_of_the_page_is_a_file(kind, run, tmp_path, command):
     folder = tmp_path / "figures"
@@ -106,7 +106,7 @@ def entries(count):
     return Entries("P", "meaning", names, names, value, np.full_like(value, 0.1), *words)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("count", "small"), [(4, False), pytest.param(30, False, marks=pytest.mark.nightly), (5, True)]
 )

@@ -15,7 +15,7 @@ from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 SVG = "{http://www.w3.org/2000/svg}"
 

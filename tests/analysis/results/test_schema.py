@@ -48,7 +48,7 @@ def test_every_reference_has_its_record_and_every_record_is_used(name):
     assert used == set(schema["$defs"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_session_of_the_twin(report_of):
     result = report_of("analyse", GOLDEN)
     assert faults("analysis", result) == []

@@ -16,7 +16,7 @@ from support.ros_bags import (
     write_bag,
 )
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 fill_controller = filling(Filler.controller)
 

@@ -11,7 +11,7 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 EPOCH_NS = 1_735_689_600_000_000_000
 TICK_NS = 10_000_000

@@ -175,7 +175,7 @@ def test_nested_multiplexing(muxed, seed):
     assert (tally.frames, tally.decoded, tally.problems()) == (200, 200, [])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_frames_of_many_joints_and_sensors_at_once(seed):

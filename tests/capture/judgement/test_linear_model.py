@@ -34,7 +34,7 @@ def judged(command, *positions):
     return {fault.joint: fault for fault in judge(motions).faults}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("joints", [1, 4])
 def test_a_sound_servo_is_not_named_though_its_lag_passes_half_a_turn(name, joints):

@@ -68,7 +68,7 @@ def test_the_viewer_is_reruns_own(rerun_command):
     assert re.search(r"\b0\.41\.", rerun_command("--version"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_web_serves_this_machine_only_until_it_is_ended(session_file, tmp_path):
     if not Path("/proc/net/tcp").exists():
         pytest.skip("listening sockets are read from /proc/net/tcp")

@@ -8,7 +8,7 @@ from support.written_topics import write_topics
 from undulog.capture import Session
 from undulog.replay.recording import write_recording
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 @pytest.fixture(scope="module")

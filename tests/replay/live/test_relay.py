@@ -18,7 +18,7 @@ from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
 from undulog.replay.live.relay import SILENCE_S, Inbox, Relay
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
     recorder = stage.recorder()
     recorder.send(0.0, 1.5, wait=False)
@@ -35,7 +35,7 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back):
     recorder, relay = stage.recorder(), stage.relay()
     recorder.connect()
@@ -114,7 +114,7 @@ def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     assert len(centres) > 100  # at the origin, without odometry
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_noise_on_the_socket_is_counted_and_borne(stage):
     recorder, relay = stage.recorder(), stage.relay()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:

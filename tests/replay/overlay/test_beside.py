@@ -25,7 +25,7 @@ from undulog.replay.overlay.sessions import Align, align, convert, read_side, ti
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
 LAG = 0.7

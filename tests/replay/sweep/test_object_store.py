@@ -36,7 +36,7 @@ def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
     assert opened(tmp_path / "run.mcap").session_id in {row["session_id"] for row in rows}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("bucket")
 def test_a_bucket_that_is_not_there_is_named(tmp_path):
     done = undulog("sweep", write_plan(tmp_path), "-o", "s3://nowhere/strength", code=1)

@@ -114,6 +114,7 @@ def test_single_precision_keeps_gain_and_lag_within_a_thousandth(weak):
     assert error.max() < 1e-3
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("law", LAWS)
 def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
     scenario = with_law(uneven, law)

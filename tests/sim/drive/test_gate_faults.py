@@ -169,7 +169,7 @@ def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     assert "\n  [safety]\n  max_rate = " in noted
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(small, tmp_path):
     write, sessions = gate_stage.commanded, {}
     joints = ("joint01", "joint02", "joint03", "wheel")
@@ -284,7 +284,7 @@ def test_a_robot_that_is_gone_leaves_a_whole_session(driving):
 # -- what is well -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("plain", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
     short = gate_stage.commanded(tmp_path / "short.mcap", small[0], 3.0)

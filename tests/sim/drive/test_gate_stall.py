@@ -142,8 +142,20 @@ def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=
             yield drive
 
 
-@pytest.mark.parametrize("kind", ["polled", "unasked"])
-@pytest.mark.parametrize("stall_s", [0.2, 1.0, 5.0])
+def cases(named, by_day):
+    """Return parameters, of which others than those by day are for the night.
+
+    Each kind of confirmation is stopped, and each way of a router delayed, in one of the cases by
+    day; the rules themselves are tested on a simulated clock (``test_gate_machine.py``).
+    """
+    night = pytest.mark.nightly
+    return [pytest.param(*v, id=k, marks=() if k in by_day else night) for k, v in named.items()]
+
+
+STOPS = {f"{k}, {s} s": (k, s) for s in (0.2, 1.0, 5.0) for k in ("polled", "unasked")}
+
+
+@pytest.mark.parametrize(("kind", "stall_s"), cases(STOPS, {"polled, 1.0 s", "unasked, 0.2 s"}))
 def test_a_far_end_that_stops_is_held_and_then_brought_to_rest(folder, tmp_path, kind, stall_s):
     with driving(folder, tmp_path, kind, duration_s=4.0 + stall_s) as drive:
         drive.stop_far_end(stall_s)
@@ -152,7 +164,10 @@ def test_a_far_end_that_stops_is_held_and_then_brought_to_rest(folder, tmp_path,
     drive.check_held()
 
 
-@pytest.mark.parametrize("kind", ["polled", "unasked"])
+BOTH = {kind: (kind,) for kind in ("polled", "unasked")}
+
+
+@pytest.mark.parametrize("kind", cases(BOTH, {"polled"}))
 def test_short_stalls_change_no_joint_beyond_the_bound(folder, tmp_path, kind):
     with driving(folder, tmp_path, kind, duration_s=5.0) as drive:
         for stall_s in (0.02, 0.03, 0.02, 0.025, 0.02):
@@ -163,17 +178,17 @@ def test_short_stalls_change_no_joint_beyond_the_bound(folder, tmp_path, kind):
 
 
 WAYS = {
-    "up": ["hold up", 0.4, "hold none"],
-    "down": ["hold down", 0.4, "hold none"],
-    "up, down": ["hold up", 0.025, "hold both", 0.1, "hold down", 0.1, "hold none"],
-    "bursts": ["bursts 0.025", 1.0, "bursts 0"],
-    "wide bursts": ["bursts 0.1", 1.0, "bursts 0"],
-    "late": ["late 0.015", 0.5, "late 0.1", 0.5, "late 0"],
-    "late bursts": ["late 0.02", "bursts 0.025", 1.0, "bursts 0"],
+    "up": (["hold up", 0.4, "hold none"],),
+    "down": (["hold down", 0.4, "hold none"],),
+    "up, down": (["hold up", 0.025, "hold both", 0.1, "hold down", 0.1, "hold none"],),
+    "bursts": (["bursts 0.025", 1.0, "bursts 0"],),
+    "wide bursts": (["bursts 0.1", 1.0, "bursts 0"],),
+    "late": (["late 0.015", 0.5, "late 0.1", 0.5, "late 0"],),
+    "late bursts": (["late 0.02", "bursts 0.025", 1.0, "bursts 0"],),
 }
 
 
-@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+@pytest.mark.parametrize("way", cases(WAYS, {"up, down", "late", "late bursts"}))
 def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
     with driving(folder, tmp_path, "polled", duration_s=4.0) as drive:
         for each in way:
@@ -185,7 +200,7 @@ def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
     drive.check_bound()
 
 
-@pytest.mark.parametrize("kind", ["polled", "unasked"])
+@pytest.mark.parametrize("kind", cases(BOTH, {"unasked"}))
 def test_a_half_open_connection_ends_without_a_ramp(folder, tmp_path, kind):
     with driving(folder, tmp_path, kind, duration_s=20.0) as drive:
         drive.route("hold both")
@@ -208,7 +223,7 @@ HEALTHY = {
 }
 
 
-@pytest.mark.parametrize(("kind", "more"), HEALTHY.values(), ids=HEALTHY)
+@pytest.mark.parametrize(("kind", "more"), cases(HEALTHY, {"20 Hz", "16 ms, asked", "lossy"}))
 def test_a_bus_that_is_slow_late_or_lossy_is_never_held(folder, tmp_path, kind, more):
     with driving(folder, tmp_path, kind, duration_s=4.0, **more) as drive:
         drive.end()

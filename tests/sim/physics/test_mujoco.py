@@ -104,7 +104,7 @@ def test_engines_agree_on_an_uneven_body_that_tumbles(make_uneven):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_processes_find_the_same_bits(tmp_path):
     code = """
 import dataclasses, hashlib

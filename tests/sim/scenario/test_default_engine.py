@@ -18,7 +18,7 @@ def run(folder, *hidden, scenario="flat"):
     return python(RUN.format(hide=hide, scenario=scenario), cwd=folder)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("hidden", "engine"), [((), "bullet"), (("pybullet",), "mujoco")])
 def test_the_twin_runs_on_the_engine_that_is_installed_and_names_it(tmp_path, hidden, engine):
     done = run(tmp_path, *hidden)

@@ -78,7 +78,7 @@ def controllers(draw):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @given(controllers())
 @settings(max_examples=40, deadline=None)  # each draws the robot from its file
 def test_what_is_written_reads_the_same(controller):
