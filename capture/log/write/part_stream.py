@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -155,11 +156,9 @@ class PartStream:
             os.fdatasync(self._file)
         else:
             os.fsync(self._file)
-        where = self.place
-        if where is None:
-            raise FileDeletedError(self.path, self.misplaced)
+        self._present()
         if not self._named:
-            sync_folder(where.parent)
+            self._where_it_is(lambda where: sync_folder(where.parent))
             self._named = True
 
     def rescue(self, more: int) -> None:
@@ -201,19 +200,23 @@ class PartStream:
             NameTakenError: If there is a file of its final name meanwhile.
             OSError: If the disk fails.
         """
-        where = self.place
-        if where is None:
-            raise FileDeletedError(self.path, self.misplaced)
-        output = self.path if where == self._unfinished else where.with_name(self.path.name)
-        try:
-            publish(where, output, replace=self._force)
-        except FileExistsError as error:
-            raise NameTakenError(
-                output,
-                f"another program made a file of this name; the recording is in {where}, whole: "
-                "rename it",
-            ) from error
-        self.path = output
+
+        def give_name(where: Path) -> None:
+            output = self.path if where == self._unfinished else where.with_name(self.path.name)
+            try:
+                if where == output:  # it has got its name, and was moved, or is looked at again
+                    sync_folder(where.parent)
+                else:
+                    publish(where, output, replace=self._force)
+            except FileExistsError as error:
+                raise NameTakenError(
+                    output,
+                    f"another program made a file of this name; the recording is in {where}, "
+                    "whole: rename it",
+                ) from error
+            self.path = output
+
+        self._where_it_is(give_name)
 
     def close(self) -> str:
         """Close the file and return the SHA-256 of its contents."""
@@ -231,6 +234,27 @@ class PartStream:
                 where.unlink()
 
     # -- inside ----------------------------------------------------------------------------
+
+    def _present(self) -> Path:
+        """Where the file is now; FileDeletedError if it has no name any more."""
+        if (where := self.place) is None:
+            raise FileDeletedError(self.path, self.misplaced)
+        return where
+
+    def _where_it_is(self, act: Callable[[Path], None]) -> None:
+        """Do something to the file by its name; again if it was moved since that was read."""
+        where = self._present()
+        while True:
+            failure = None
+            try:
+                act(where)
+            except FileNotFoundError as error:
+                failure = error
+            before, where = where, self._present()
+            if where == before:
+                if failure is not None:
+                    raise failure
+                return
 
     def _folder_is_there(self) -> bool:
         try:

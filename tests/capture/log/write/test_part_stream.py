@@ -108,6 +108,38 @@ def test_a_file_that_was_moved_gets_its_name_where_it_is(stream, folder):
     assert (names(folder), stream.path.read_bytes()) == ([], b"x")
 
 
+@pytest.mark.parametrize("step", ["sync_folder", "publish"])
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("another", [False, True])
+def test_a_folder_may_move_between_two_looks_at_it(stream, monkeypatch, step, after, another):
+    folder = stream.path.parent
+    moved, done = folder.parent / "moved", getattr(part_stream, step)
+    seen = []
+    if after:
+        stream.sync()
+
+    def at_a_bad_moment(*words, **options):
+        seen.append(words[0])
+        if len(seen) == 1:
+            if after and step == "publish":  # when the file has its name
+                done(*words, **options)
+            folder.rename(moved)
+            if another:
+                folder.mkdir()
+        done(*words, **options)
+
+    put_all(stream, LONG)
+    monkeypatch.setattr(part_stream, step, at_a_bad_moment)
+    stream.sync()
+    stream.publish()
+    monkeypatch.undo()
+    here = moved if seen else folder
+    assert step == "publish" or not seen or moved in seen, "another folder was synced"
+    assert names(here) == ["run.mcap"]
+    assert (here / "run.mcap").read_bytes() == LONG
+    assert stream.path == here / "run.mcap"
+
+
 def test_a_name_that_was_taken_is_not_written_over(stream, folder):
     stream.put(memoryview(b"x"))
     (folder / "run.mcap").write_bytes(b"of another program")
