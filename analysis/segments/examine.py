@@ -10,6 +10,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
+from undulog.capture.judgement.levels import reaches
 
 from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response.response import Response
@@ -134,7 +135,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
         found = [
             each
             for each in contrasts(profile, active)
-            if abs(each.value) > max(critical * each.error, profile.margin - critical * each.error)
+            if reaches(abs(each.value), critical * each.error, profile.margin)
             and (each.kind == "each" or each.spread**2 >= half)
         ]
         if len(chain.names) < MIN_JOINTS:

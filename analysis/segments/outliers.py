@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.judgement.levels import HALF, LEVEL, ROBUST, TINY, WHOLE
+from undulog.capture.judgement.levels import HALF, LEVEL, ROBUST, TINY, WHOLE, reaches
 
 from .profile import (
     ENDS,
@@ -245,12 +245,8 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
 
 
 def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
-    """Return whether a deviation exceeds its interval and the others' residuals.
-
-    The interval isn't within the margin.
-    """
-    half = critical * one.error
-    if abs(one.value) <= max(half, profile.margin - half):
+    """Return whether a deviation reaches the margin and exceeds the others' residuals."""
+    if not reaches(abs(one.value), critical * one.error, profile.margin):
         return False
     others = state.active.copy()
     others[one.joint] = False

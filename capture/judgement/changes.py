@@ -22,6 +22,7 @@ from .levels import (
     FEWEST,
     FULL,
     GAIN_MARGIN,
+    LEAST_RANGE_RAD,
     NEGLIGIBLE,
     QUARTER,
     REST_ERRORS,
@@ -29,6 +30,7 @@ from .levels import (
     TAME,
     TINY,
     WIDTH,
+    reaches,
 )
 from .motion import Course, cycle_s, is_sweep
 from .shifts import (
@@ -113,7 +115,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     Returns:
         Those beyond the level and the size that matters, joint by joint.
     """
-    blocks = _blocks(course, exposure, usable)
+    blocks = _blocks(course, exposure, usable & _runs(course, exposure))
     if blocks is None:
         return []
     best: dict[int, tuple[float, Jump]] = {}
@@ -137,6 +139,19 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
             if quantity == "offset":
                 offer(k, "drift", drift_of(value, weight, rho, tests))
     return [best[k][1] for k in sorted(best)]
+
+
+def _runs(course: Course, exposure: Exposure) -> BoolArray:
+    """Mark the steps from the first motion of a command to the last one and its settling."""
+    runs = np.zeros(course.t_s.size, dtype=np.bool_)
+    begins, ends = (
+        np.flatnonzero(np.any(np.abs(course.command - course.command[:, [k]]) > LEAST_RANGE_RAD, 0))
+        for k in (0, -1)
+    )
+    if begins.size and ends.size:
+        settling = int(np.max(exposure.settling_s) / course.step_s)
+        runs[max(int(begins[0]) - 1, 0) : int(ends[-1]) + 2 + settling] = True
+    return runs
 
 
 def _jump(k: int, quantity: str, run: Shift, edges_s: FloatArray) -> Jump:
@@ -168,7 +183,7 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
-        return not alone and _reaches(run, NOISE_MARGIN)
+        return compared and _reaches(run, 2 * NOISE_MARGIN if alone else NOISE_MARGIN)
     lost = float(blocks.lost_rad[k]) if alone else 0.0
     if quantity in ("offset", "drift"):
         return _reaches(run, ANGLE_MARGIN_RAD) and abs(run.change) > lost
@@ -190,8 +205,8 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
 
 
 def _reaches(run: Shift, margin: float) -> bool:
-    """Return whether the 95 % interval of a change, that excludes 0, isn't within a margin."""
-    return abs(run.change) + WIDTH * run.error > margin
+    """Return whether a change, by its 95 % interval, reaches a margin."""
+    return reaches(abs(run.change), WIDTH * run.error, margin)
 
 
 def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | None:
@@ -273,6 +288,10 @@ def _regressed(
     )
     weights[:, count < FULL * width] = 0
     weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
+    # A block tells by so much less as what is left in it is more than usual.
+    squares = moments[:, TERMS, TERMS] - np.einsum("bi,bi->b", estimate, target)
+    left = np.maximum(squares, 0) / np.maximum(count, 1)
+    weights[:TERMS] /= np.maximum(left / max(_middle(left[count > 0]), TINY), 1)
     return estimate.T, weights
 
 

@@ -21,12 +21,11 @@ from .changes import SHORTEST_S, Jump, find_jumps
 from .exposure import Exposure, agrees, exposure_of, median_response, responds
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .levels import (
-    ANGLE_MARGIN_RAD,
     FEWEST,
     FOLLOWS,
-    FULL,
     HALF,
     LARGEST_REST_RAD,
+    LEAST_RANGE_RAD,
     QUARTER,
     REST_ERRORS,
     TINY,
@@ -44,9 +43,6 @@ from .stillness import Stillness, stillness_of, usable_steps
 
 UNIT_SLACK = 2.0
 """Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it."""
-
-LEAST_RANGE_RAD = (1 - FULL) * ANGLE_MARGIN_RAD
-"""A command that moves less is held still [rad]: a step of a 12-bit encoder is 0.09 degrees."""
 
 MOVING = frozenset({"swapped", "inverted", "inverted_sensor", "noisy_sensor"})
 """Kinds of a joint that moves, though not as commanded."""

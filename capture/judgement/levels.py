@@ -46,6 +46,9 @@ GAIN_MARGIN = 0.02
 ANGLE_MARGIN_RAD = float(np.radians(1.0))
 """Angle that matters [rad]: the margin of "alike"."""
 
+LEAST_RANGE_RAD = (1 - FULL) * ANGLE_MARGIN_RAD
+"""A command that moves less is held still [rad]: a step of a 12-bit encoder is 0.09 degrees."""
+
 REST_ERRORS = 3
 """Rest errors beyond which a motion is asked for: one at either end is lost in a dead band, and one
 is noise; also standard deviations of what is no chance, and cycles on either side of a change."""
@@ -68,3 +71,17 @@ MISSING = 1.5
 
 TINY = float(np.sqrt(np.finfo(np.float64).tiny))
 """What stands for 0 in a denominator; its inverse may be squared."""
+
+
+def reaches(size: float, half: float, margin: float) -> bool:
+    """Return whether a difference is stated: its interval excludes 0 and isn't within the margin.
+
+    What comes within a twentieth of the margin reaches it: sampling and quantisation move an
+    estimate by so much beside its interval.
+
+    Args:
+        size: The difference, positive.
+        half: Half the interval.
+        margin: What matters, in the same unit.
+    """
+    return size > max(half, COVERAGE * margin - half)

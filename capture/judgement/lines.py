@@ -19,7 +19,7 @@ import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
 from .exposure import Exposure
-from .levels import ANGLE_MARGIN_RAD, FEWEST, LEVEL, REST_ERRORS, TINY, WIDTH
+from .levels import ANGLE_MARGIN_RAD, COVERAGE, FEWEST, LEVEL, REST_ERRORS, TINY, WIDTH
 from .motion import Course, cycle_s
 
 TAPERS = FEWEST
@@ -70,7 +70,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
         others = [j for j in exposure.group(k) if j != k]
         common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
         least = _least_rad(frequency, course, exposure, k)
-        sure = (tail[k] < LEVEL / tests) & (amplitude[k] + WIDTH * error[k] > least)
+        sure = (tail[k] < LEVEL / tests) & (amplitude[k] + WIDTH * error[k] > COVERAGE * least)
         sure &= (amplitude[k] > NEIGHBOURS * common) & _free(
             frequency, course, k, like=len(others) > 2
         )

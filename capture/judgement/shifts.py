@@ -107,7 +107,7 @@ def largest_shift(
         return None
     best: tuple[float, Shift] | None = None
     for lasting in (True, False):
-        first, last = _runs(known.size, shortest, lasting=lasting)
+        first, last = _runs(known, values.size, shortest, lasting=lasting)
         if not first.size:
             continue
         change, outside, error = _fitted(v, w, first, last, rho)
@@ -184,10 +184,19 @@ def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, 
     return within, beyond
 
 
-def _runs(count: int, shortest: int, *, lasting: bool) -> tuple[IntArray, IntArray]:
-    """Return first block and the one after the last of runs to one end, or within."""
+def _runs(
+    known: IntArray, blocks: int, shortest: int, *, lasting: bool
+) -> tuple[IntArray, IntArray]:
+    """Return first block and the one after the last of runs to one end, or within.
+
+    Of the blocks that are known; a run to one end is shortest in time, and half of it is known: in
+    the first blocks a response settles.
+    """
+    count = known.size
     if lasting:
-        cuts = np.arange(shortest, count - shortest + 1)
+        least = max(2, shortest // 2)
+        cuts = np.arange(least, count - least + 1)
+        cuts = cuts[(known[cuts] >= shortest) & (known[cuts - 1] < blocks - shortest)]
         half = cuts * 2 > count  # the shorter part is what changed
         first = np.where(half, cuts, 0)
         last = np.where(half, count, cuts)

@@ -23,7 +23,7 @@ def test_each_run_is_fitted_as_by_the_inverse_covariance(rho, lasting):
     every = np.arange(n)
     covariance = rho ** np.abs(every[:, None] - every) / np.sqrt(np.outer(weights, weights))
     inverse = np.linalg.inv(covariance)
-    first, last = _runs(n, 2, lasting=lasting)
+    first, last = _runs(every, n, 2, lasting=lasting)
     change, outside, error = _fitted(values, weights, first, last, rho)
     for k in range(first.size):
         inside = (every >= first[k]) & (every < last[k])
@@ -85,3 +85,14 @@ def test_one_block_alone_is_no_change_however_large():
     values = drawn(np.random.default_rng(5), 0.0)
     values[1, 20] = 1000
     assert not any(any(pair) for pair in found(values, np.ones_like(values)))
+
+
+def test_blocks_in_which_a_response_settles_count_as_time():
+    values = np.full(15, 0.01)
+    values[:4] = 1.0
+    # 17 blocks, of which the first two tell nothing: the change comes after six.
+    values = np.concatenate([[0.0, 0.0], values + 1e-3 * np.sin(np.arange(15.0) ** 2)])
+    weights = np.concatenate([[0.0, 0.0], np.ones(15)])
+    shift = largest_shift(values, weights, 0.0, 4, 6, compared=True)
+    assert shift is not None
+    assert (shift.first, shift.last) == (0, 6)
