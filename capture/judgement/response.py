@@ -148,8 +148,30 @@ def fit_response(
     c, y = command[::stride][parts], position[::stride][parts]
     there = present[::stride][parts]
     filtered = Filtered(c, stride * step_s)
-    trimmed = _Trimmed(filtered.output(USUAL), y, there.astype(np.float64))
-    bounds = _bounds(command, step_s)
+    weight, bounds = there.astype(np.float64), _bounds(command, step_s)
+    found = _fitted(filtered, y, weight, bounds)
+    # A zero that drifts looks like gain and poles, the more so the slower the command is.
+    left = y - found[1].gain * filtered.output(found[1])
+    drift = _line(left, parts - parts.mean(), weight)
+    if np.var(left - drift) < HALF * np.var(left):
+        level = _fitted(filtered, y - drift, weight, bounds)
+        if level[0] < HALF * found[0]:
+            return level[1]
+    return found[1]
+
+
+def _line(values: FloatArray, along: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the line through values, less its middle."""
+    power = float(np.sum(weight * along**2))
+    centred = weight * (values - np.average(values, weights=weight))
+    return along * (float(np.sum(centred * along)) / max(power, TINY))
+
+
+def _fitted(
+    filtered: Filtered, y: FloatArray, weight: FloatArray, bounds: tuple[float, float]
+) -> _Fit:
+    """Fit the three orders and choose one of them."""
+    trimmed = _Trimmed(filtered.output(USUAL), y, weight)
     best = [trimmed.best(filtered.outputs(tried), tried) for tried in _grids(*bounds)]
     steps = [bounds[0] / (SEARCH - 1) / 2] * len(best)
     for _ in range(SEARCH):
@@ -168,7 +190,7 @@ def fit_response(
         # A pole more takes off a twentieth of the squares, or the simpler response stands.
         if fit[0] < COVERAGE * chosen[0]:
             chosen = fit
-    return _polished(chosen, trimmed, filtered, bounds, SEARCH)[1]
+    return _polished(chosen, trimmed, filtered, bounds, SEARCH)
 
 
 def _polished(

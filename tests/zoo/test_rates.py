@@ -265,9 +265,18 @@ def test_the_manual_says_what_is_stated_of_recordings():
     assert "\n".join(recorded_page.lines()) in page, "renew it: python -m zoo.recorded_page"
 
 
+BY_DAY = {"so101/chirp_sweep", "so101/pick_place", "go2/traj_0", "kuka"}
+"""Recordings of other robots and motions; the others are for the night."""
+
+
 @needs_recordings
-@pytest.mark.slow
-@pytest.mark.parametrize("name", recordings())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in BY_DAY else pytest.mark.nightly)
+        for name in recordings()
+    ],
+)
 def test_no_joint_of_a_sound_robot_is_accused(name):
     assert stated(recordings()[name]()).accused == ()
 

@@ -300,7 +300,7 @@ def _write_many(arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("writers", "results"), [(5, 13), pytest.param(16, 20, marks=pytest.mark.nightly)]
+    ("writers", "results"), [(3, 22), pytest.param(16, 20, marks=pytest.mark.nightly)]
 )
 def test_many_writers_at_once_lose_no_row(writers, results, lab):
     # Each imports all by itself: libraries that have threads can't be forked safely.

@@ -69,9 +69,15 @@ def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     assert (browser.requests(), browser.complaints()) == ([url], [])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dark", SCHEMES)
-@pytest.mark.parametrize("name", ["snake", "both_ways", "kicked"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("snake", marks=pytest.mark.slow),
+        pytest.param("both_ways", marks=pytest.mark.nightly),
+        pytest.param("kicked", marks=pytest.mark.nightly),
+    ],
+)
 def test_all_text_stands_out_from_its_ground(browser, address, name, dark):
     # WCAG 2.2, success criterion 1.4.3: 4.5 to 1.
     browser.open(address(name), dark=dark)
