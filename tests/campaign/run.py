@@ -79,7 +79,7 @@ PARTS = {
     "gate": Part(gate.run, 40, 1, alone=True),
     "interruptions": Part(interruptions.run, 60, 1),
     "interruptions_drive": Part(interruptions_drive.run, 40, 1, alone=True),
-    "servers": Part(servers.run, 60, 5),
+    "servers": Part(servers.run, 60, 3),
     "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
     "injection": Part(injection.run, 400, 6),
     "disks": Part(disks.run, 400, 5),
@@ -96,7 +96,7 @@ PARTS = {
     "bags": Part(partial(mutated, part="bags"), 500, 5),
     "binary": Part(partial(mutated, part="binary"), 4_500, 5),
     "serial": Part(partial(mutated, part="serial"), 1_000, 5),
-    "mutated": Part(mutated, 38_294, 24),
+    "mutated": Part(mutated, 38_294, 12),
 }
 LONG = sum(part.long for part in PARTS.values())
 

@@ -189,7 +189,7 @@ def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, com
     assert glowing(frame).sum() > 500
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_a_vulkan_driver_the_packages_are_named(session_file, tmp_path):
     env = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent")
     done = undulog("view", session_file, "--clip", tmp_path / "a.mp4", env=env, code=1)

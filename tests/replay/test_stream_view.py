@@ -173,6 +173,7 @@ def test_an_interrupt_while_it_is_converted_ends_the_command(shown):
     assert not Path(f"/proc/{viewer}").exists()
 
 
+@pytest.mark.nightly
 def test_a_viewer_that_is_killed_is_reported(shown):
     os.kill(viewer_of(shown), signal.SIGKILL)
     assert shown.finish() == (1, "", "error: the Rerun viewer was ended by signal 9\n")

@@ -15,7 +15,7 @@ SEED = 20250131
 """Of the fast test; printed with what fails."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("per_servo", [False, True])
 def test_bags_are_read_back_by_another_reader(tmp_path, per_servo):
     channels = Channels("true", effort=True, second=True)

@@ -86,7 +86,7 @@ def test_bags_in_folders_and_patterns_are_one_session_each(bags):
     assert sessions_of([single]) == [single]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "line",
     [("log", "info"), ("log", "check"), pytest.param(("analyse",), marks=pytest.mark.nightly)],

@@ -188,6 +188,7 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
             np.testing.assert_array_equal(first.t_ns, second.t_ns)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["bag", "mcap", pytest.param("db3", marks=pytest.mark.nightly)])
 def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypatch):
     def write(own, *tick):

@@ -302,7 +302,7 @@ def written_and_imported(suffix, frames):
     assert abs(late).max() <= error_ns
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_python_cans_writer_and_import(suffix, count):

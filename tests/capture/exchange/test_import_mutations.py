@@ -88,7 +88,7 @@ def imported(path, robot):
 
 BINARY = (".blf", ".db")
 """Each import starts a process."""
-MARKS = {".blf": pytest.mark.slow, ".db": pytest.mark.nightly}
+MARKS = {".blf": pytest.mark.nightly, ".db": pytest.mark.nightly}
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(s, marks=MARKS.get(s, ())) for s in SUFFIXES])

@@ -165,7 +165,7 @@ def dataset(folder, width=2, **columns):
     return folder / "set"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("column", ["episode_index", "frame_index"])
 @pytest.mark.parametrize("cells", [[None, 1] * 10, ["a"] * 20, [[1]] * 20, [0.5] * 20])
 def test_frames_numbered_by_what_is_no_number(tmp_path, column, cells):
@@ -218,7 +218,7 @@ UNEVEN = [[0.1], [0.1, 0.2, 0.3]] * 10, [[0.1, 0.2], None] * 10, [None, [0.1] * 
 ODD = ["a", "b"] * 10, [[[1.0]]] * 20, [{"x": 1.0}] * 20, [None] * 20, [[]] * 20
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("cells", [*UNEVEN, *ODD])
 def test_actions_that_are_no_numbers(tmp_path, cells):
     with pytest.raises(ImportFormatError, match="action"):

@@ -79,7 +79,7 @@ def test_an_import_of_the_table_gives_the_session(suffix, staggered, tmp_path, c
 RECORDINGS = ("so101/multisine", "so101/coupled_joints", "go2/traj_0.pt")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("suffix", WIDE_FORMATS)
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_real_recordings_come_back(name, suffix, tmp_path, opened):

@@ -151,7 +151,7 @@ def without_rounding(health):
     return [getattr(rounded, name) for name in (*names, "series")]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @given(faults)
 @settings(max_examples=60, deadline=None)
 def test_the_live_verdict_is_that_of_the_finished_file(tmp_path_factory, wrong):

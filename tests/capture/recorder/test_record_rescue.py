@@ -152,7 +152,8 @@ def test_nothing_is_rescued_where_there_is_no_room_and_that_is_said(case, disk_o
 @pytest.mark.slow
 def test_a_split_recording_reports_what_went_with_its_folder(case, command, tmp_path):
     def harm(case):
-        wait_for((case.place / "run.mcap").exists, "the first part")
+        second = case.place / "run_0002.mcap.part"  # written when all of the first is done
+        wait_for(lambda: second.exists() and second.stat().st_size > 0, "the second part")
         shutil.rmtree(case.place)
 
     code, report, errors = case.run(harm, "--split-time", "1s")

@@ -79,7 +79,7 @@ def measured_in_batches(path, length_ns):
     return [*found, *meter.add(log.decode(batch), log.robot)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("length_ns", [30_000_000, 700_000_000, 7_000_000_000, 20_000_000_000])
 def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
     with Session.open(walk) as session:

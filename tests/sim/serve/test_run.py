@@ -215,7 +215,7 @@ def test_times_over_the_bus_are_those_of_the_run(run, opened):
             assert np.ptp(late) < 2_000_000
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario, opened):
     words = ("lost:joint07:0.2", "frozen:joint03@0.2", "noise:0.02", "bus-off@1.5+0.4")
     faults = [word for text in words for word in ("--fault", text)]

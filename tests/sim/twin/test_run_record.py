@@ -11,7 +11,7 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.robot.run import RUN_RECORD
 from undulog.sim import parse_scenario, record
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 SCENARIO = f"""
 name = "changed"
