@@ -27,7 +27,7 @@ from .planted import Least
 from .planted_faults import FAULTS, KINDS, draw, plant, record
 from .rates_table import table
 from .recordings import recordings
-from .verdicts import SECONDS, Verdict, judged
+from .verdicts import Verdict, judged
 
 HEALTHY, RECORDED = "healthy", "recorded"
 """Names of rows without a fault: of a drawn robot, of a recording."""
@@ -36,6 +36,9 @@ ROWS = "rows.jsonl"
 LONGEST_PERIOD_S = 4.0
 """Period of a recorded motion at most, where an onset is judged [s]: what repeats within a minute
 or not at all gives no longer time to find an onset. The recorded gaits have periods up to 4 s."""
+
+SLACK_S = 0.5
+"""Difference of the onsets of an accusation with and without a fault, that is the same one [s]."""
 
 PENDING = 4
 """Sessions a process that are handed out ahead: an interrupt loses no more than these."""
@@ -80,10 +83,14 @@ def run_task(task: Task) -> dict:
         return row | {"seen": True, "error": traceback.format_exc(limit=-3), "right": False}
 
 
+def _times(robot) -> dict[str, float]:
+    return {"period_s": robot.motion.period_s, "length_s": float(robot.t_s[-1])}
+
+
 def _healthy(task: Task) -> dict:
     robot = draw(task.kind, task.seed)
     statement = stated(record(robot, seed=task.seed))
-    verdict = judged(statement, robot.names, (), period_s=robot.motion.period_s)
+    verdict = judged(statement, robot.names, (), **_times(robot))
     return {
         **_row(statement, verdict),
         "joints": robot.m,
@@ -104,7 +111,7 @@ def _planted(task: Task) -> dict:
         statement,
         robot.names,
         fault.joints,
-        period_s=robot.motion.period_s,
+        **_times(robot),
         undecidable=fault.undecidable,
     )
     return {
@@ -132,7 +139,7 @@ def _recorded(task: Task) -> dict:
     signals, as_it_is = _recording(task.kind)
     if task.fault == RECORDED:
         statement = as_it_is
-        verdict = judged(statement, signals.names, (), period_s=1.0)
+        verdict = judged(statement, signals.names, (), period_s=1.0, length_s=1.0)
         refuted = [a.joint for a in statement.accused if _refuted(signals, a)]
         return {**_row(statement, verdict), "refuted": refuted, "right": not verdict.accusations}
     if task.seed not in real_faults.exposed_joints(signals):
@@ -146,14 +153,17 @@ def _recorded(task: Task) -> dict:
     before = {a.joint for a in as_it_is.accused}
     fresh = tuple(a for a in statement.accused if not any(_same(a, b) for b in as_it_is.accused))
     fresh_statement = replace(statement, accused=fresh)
-    verdict = judged(fresh_statement, signals.names, (fault.truth,), period_s=period_s)
+    length_s = float(signals.t_s[-1] - signals.t_s[0])
+    verdict = judged(
+        fresh_statement, signals.names, (fault.truth,), period_s=period_s, length_s=length_s
+    )
     more = tuple(name for name in verdict.accusations if name not in before)
     return {
         **_row(statement, verdict),
         "planted": [signals.names[task.seed]],
         "since_s": fault.truth.since_s,
         "accusations": more,
-        "right": verdict.joint and verdict.kind and verdict.onset and not more,
+        "right": verdict.joint and verdict.kind and not more,
     }
 
 
@@ -161,7 +171,7 @@ def _same(accused: Accused, before: Accused) -> bool:
     """Whether an accusation is as it was without the fault, within the slack of an onset."""
     apart_s = abs((accused.since_s or 0.0) - (before.since_s or 0.0))
     same = (accused.joint, accused.kinds) == (before.joint, before.kinds)
-    return same and apart_s <= SECONDS
+    return same and apart_s <= SLACK_S
 
 
 def _refuted(signals: Signals, accused: Accused) -> bool:

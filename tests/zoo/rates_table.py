@@ -15,6 +15,9 @@ RIGHT = 0.95
 """Share of planted faults that are to be right: one of three half-widths of a 95 % interval is
 missed hardly ever, and the level of a statement of difference is what is left to be wrong."""
 
+ONSET = 0.90
+"""Share of the faults that are right and begin within the record whose onset is to be right."""
+
 HALVES = 3.0
 """Size of a planted fault in half-widths from which it has a bar."""
 
@@ -96,7 +99,7 @@ def _healthy_line(name: str, rows: list[dict]) -> tuple[str, bool]:
 
 
 FAULT_HEAD = (
-    f"{'fault':<18} sessions  right (at least)  joint  kind  onset  accuse another  "
+    f"{'fault':<18} sessions  right (at least)  joint  kind  onset (of, at least)  accuse another  "
     "alike  silent  not planted"
 )
 
@@ -111,9 +114,13 @@ def _fault_line(name: str, rows: list[dict]) -> tuple[str, bool]:
     # Smaller faults than the bar speaks of are a curve.
     has_bar = min((row["halves"] for row in seen), default=0.0) >= HALVES
     right, limit = count("right"), least(RIGHT, sessions) if has_bar else 0
-    is_met = right >= limit
+    begun = [row for row in seen if row.get("right") and row.get("since_s") is not None]
+    onset = sum(bool(row.get("onset")) for row in begun)
+    onsets = least(ONSET, len(begun)) if has_bar else 0
+    is_met = right >= limit and onset >= onsets
     text = f"{name:<18} {sessions:>8}  {right:>5} {f'({limit})':>10}  {count('joint'):>5} "
-    text += f"{count('kind_right'):>5}  {count('onset'):>5}  {count('accusations'):>14}  "
+    text += f"{count('kind_right'):>5}  {onset:>5} {f'({len(begun)}, {onsets})':>14}  "
+    text += f"{count('accusations'):>14}  "
     text += f"{count('alike'):>5}  {count('silent'):>6}  {len(rows) - sessions:>11}"
     return f"{text}{_mark(is_met)}", is_met
 

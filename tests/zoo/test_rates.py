@@ -306,3 +306,11 @@ def test_recordings_are_read_as_their_page_describes_them():
 
 def robot_columns(signals, joint):
     return signals.commands[:, joint], signals.positions[:, joint]
+
+
+def test_onsets_of_right_statements_have_a_bar_of_their_own():
+    early = [row("gain_from", "", k, since_s=9.0, onset=k >= 10) for k in range(50)]
+    lines, is_met = table(early)
+    assert "(50, 40)" in lines[1]
+    assert is_met
+    assert not table([{**each, "onset": False} for each in early])[1]

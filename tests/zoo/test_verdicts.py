@@ -25,7 +25,7 @@ def accused(joint="a2", kinds=("jammed", "dead"), since_s=10.4):
 
 
 def judge(statement, *joints, **more):
-    return judged(statement, NAMES, joints, period_s=1.0, **more)
+    return judged(statement, NAMES, joints, period_s=1.0, length_s=20.0, **more)
 
 
 def test_a_right_accusation():
@@ -47,7 +47,7 @@ def test_a_right_accusation():
 def test_a_wrong_accusation(change, wrong):
     verdict = judge(said(accused(**change)), JAM)
     assert not getattr(verdict, wrong)
-    assert not verdict.right
+    assert verdict.right == (wrong == "onset")
 
 
 def test_an_accusation_that_the_sentence_does_not_have():
@@ -68,7 +68,7 @@ def test_a_difference_names_quantity_and_sign():
     assert not judge(said(different=[Different("a2", "lag", -0.2, None)]), WEAK).kind
     late = PlantedJoint(1, WEAK.names, WEAK.allowed, WEAK.quantities, -1.0, since_s=20.0)
     assert not judge(said(different=[less]), late).onset
-    assert judge(said(different=[Different("a2", "gain", -0.2, 20.9)]), late).right
+    assert judge(said(different=[Different("a2", "gain", -0.2, 20.9)]), late).onset
 
 
 def test_silence_and_alike_are_misses():
