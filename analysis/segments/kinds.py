@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
-from undulog.capture.judgement.levels import ENOUGH_LIKE, ROBUST
+from undulog.capture.judgement.levels import ENOUGH_LIKE, HALF, ROBUST
 
 from .outliers import FAR
 
@@ -44,8 +44,8 @@ def split_of(values: FloatArray, margin: float) -> Split | None:
         margin: Difference that matters.
 
     Returns:
-        The kinds; None where the values are one group, or fall into two neighbouring parts of the
-        chain, which a shape explains.
+        The kinds; None where the values are one group, or where a shape explains them: in parts
+        along the chain, but for two parts that are level on both sides of a step.
     """
     order = np.argsort(values)
     best: Split | None = None
@@ -61,4 +61,7 @@ def split_of(values: FloatArray, margin: float) -> Split | None:
     if best is None:
         return None
     changes = int(np.count_nonzero(np.diff(np.isin(np.arange(values.size), best.first))))
-    return best if changes > 2 else None
+    sides = values[best.first], values[best.second]
+    gap = max(sides[0].min() - sides[1].max(), sides[1].min() - sides[0].max())
+    is_step = changes == 1 and max(float(np.ptp(side)) for side in sides) < HALF * float(gap)
+    return best if changes > 2 or is_step else None

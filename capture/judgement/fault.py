@@ -84,9 +84,16 @@ class Change:
     def text(self) -> str:
         """What changed, e.g. ``from 16.5 s on gain 40 % less``."""
         if self.quantity == "drift":
-            return f"its mean drifts by {math.degrees(self.change):+.2g} degrees"
+            sign = "-" if self.change < 0 else "+"
+            return f"its mean drifts by {sign}{_degrees(self.change)}"
         end = "on" if self.until_s is None else f"to {self.until_s:.1f} s"
         return f"from {self.from_s:.1f} s {end} {_size(self.quantity, self.change)}"
+
+
+def _degrees(angle_rad: float) -> str:
+    """Return the size of an angle in words, e.g. ``1 degree``."""
+    size = f"{abs(math.degrees(angle_rad)):.2g}"
+    return f"{size} {'degree' if size == '1' else 'degrees'}"
 
 
 def _size(quantity: str, change: float) -> str:
@@ -97,7 +104,7 @@ def _size(quantity: str, change: float) -> str:
             return f"{1e3 * abs(change):.2g} ms {'earlier' if change < 0 else 'later'}"
         case "offset":
             place = "below" if change < 0 else "above"
-            return f"its mean {abs(math.degrees(change)):.2g} degrees {place} what it was"
+            return f"its mean {_degrees(change)} {place} what it was"
         case _:
             return f"noise {change:.2g} times as large"
 
@@ -118,8 +125,7 @@ class ExtraMotion:
     @property
     def text(self) -> str:
         """E.g. ``also moves at 6.1 Hz, by 11 degrees``."""
-        size = f"{math.degrees(self.amplitude_rad):.2g} degrees"
-        return f"also moves at {self.frequency_hz:.3g} Hz, by {size}"
+        return f"also moves at {self.frequency_hz:.3g} Hz, by {_degrees(self.amplitude_rad)}"
 
 
 @dataclass(frozen=True)
@@ -143,8 +149,8 @@ class RestsOff:
         """E.g. ``rests up to 4.2 degrees off its command``."""
         if not self.rests:
             place = "below" if self.offset_rad < 0 else "above"
-            return f"is {abs(math.degrees(self.offset_rad)):.2g} degrees {place} its command"
-        return f"rests up to {abs(math.degrees(self.offset_rad)):.2g} degrees off its command"
+            return f"is {_degrees(self.offset_rad)} {place} its command"
+        return f"rests up to {_degrees(self.offset_rad)} off its command"
 
 
 @dataclass(frozen=True)

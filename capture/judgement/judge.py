@@ -34,7 +34,7 @@ from .levels import (
 )
 from .lines import find_lines
 from .motion import Course, JointMotion, course_of, cycle_s, rises_of, runs_of
-from .naming import Kind, Verdict, in_words, permutation_of
+from .naming import Kind, Naming, Verdict, in_words, permutation_of
 from .record import record_faults
 from .response import BLOCKS, LATEST_S, Response, fit_response
 from .rests import find_rests
@@ -239,8 +239,9 @@ def _naming(
     names = [motion.name for motion in driven]
     if naming.verdict is Verdict.EITHER:
         named = [one.delay_s for one in naming.alternatives if one.kind is Kind.AS_NAMED]
-        # A lag that servos have is no reason to doubt the names.
-        return "" if named and min(named) <= LATEST_S else in_words(naming, names), {}
+        # Lags that servos have are no reason to doubt the names.
+        usual = named and min(named) <= LATEST_S
+        return "" if usual or _explain_more(exposure, naming) else in_words(naming, names), {}
     if naming.verdict is not Verdict.PERMUTED or naming.permutation is None:
         return "", {}
     swapped = {
@@ -249,6 +250,23 @@ def _naming(
         if k != j
     }
     return in_words(naming, names), swapped
+
+
+def _explain_more(exposure: Exposure, naming: Naming) -> bool:
+    """Return whether the joints' own responses explain all of what a permutation of most would.
+
+    As with two kinds of servos, whose gains and lags differ; a few joints' own lags and other names
+    for them can't be told apart.
+    """
+    for one in naming.alternatives:
+        if one.kind is Kind.PERMUTED:
+            moved = [k for k, j in enumerate(one.permutation) if k != j]
+            own = [exposure.responses[k] for k in moved]
+            if len(moved) < WHOLE * len(one.permutation) or not all(map(responds, own)):
+                return False
+            if any(r.explained < one.explained[k] for k, r in zip(moved, own, strict=True)):
+                return False
+    return True
 
 
 def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:

@@ -8,7 +8,8 @@ transforms y_k(f) of the tapered residual and the tapers' sums h_k, the line's c
     F(f) = (K - 1) |a|^2 sum_k h_k^2 / sum_k |y_k - a h_k|^2,
 
 which without a line has Fisher's F distribution with 2 and 2K - 2 degrees of freedom; its tail is
-(1 + F / (K - 1))^-(K - 1) in closed form. Bonferroni over the frequencies and joints.
+(1 + F / (K - 1))^-(K - 1) in closed form. Bonferroni over the frequencies and joints. A line that
+comes or goes, or is near another, is beside other noise; like joints tell what noise there is.
 """
 
 from __future__ import annotations
@@ -19,11 +20,14 @@ import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
 from .exposure import Exposure
-from .levels import ANGLE_MARGIN_RAD, COVERAGE, FEWEST, LEVEL, REST_ERRORS, TINY, WIDTH
+from .levels import ANGLE_MARGIN_RAD, COVERAGE, FEWEST, FOLLOWS, LEVEL, REST_ERRORS, TINY, WIDTH
 from .motion import Course, cycle_s
 
 TAPERS = FEWEST
-"""Sine tapers: 14 degrees of freedom of the noise, with lines resolved to 8 cycles a record."""
+"""Sine tapers at most: 14 degrees of freedom of the noise, lines resolved to 8 cycles a record."""
+
+FEWEST_TAPERS = 3
+"""Sine tapers at least: two of them have a sum, and one is left for the noise."""
 
 NEIGHBOURS = 2
 """How many times the line of like joints a line is, at least, to be a joint's own."""
@@ -58,26 +62,66 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     count, size = usable.shape
     # Between the frequencies of the record a line would lose up to a third of its amplitude.
     padded = 2 << size.bit_length()
+    tapers = _tapers(course, size)
     frequency = np.asarray(np.fft.rfftfreq(padded, course.step_s), dtype=np.float64)
     residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
     amplitude, error, tail = np.empty((1 + 2, count, frequency.size))
     for k in range(count):
-        amplitude[k], error[k], tail[k] = _tested(residual[k], padded)
+        amplitude[k], error[k], tail[k] = _tested(residual[k], padded, tapers)
     tests = count * size
     lines: list[Line] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
         common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
         least = _least_rad(frequency, course, exposure, k)
-        sure = (tail[k] < LEVEL / tests) & (amplitude[k] + WIDTH * error[k] > COVERAGE * least)
-        sure &= (amplitude[k] > NEIGHBOURS * common) & _free(
-            frequency, course, k, like=len(others) > 2
-        )
-        if sure.any():
-            best = int(np.argmax(np.where(sure, amplitude[k], 0)))
-            lines.append(Line(k, float(frequency[best]), float(amplitude[k, best])))
+        sure = (tail[k] < LEVEL / tests) & (amplitude[k] > NEIGHBOURS * common)
+        if len(others) > 2:  # they show how much noise there is at a frequency
+            beside = _beside(amplitude[k], common, len(others)) < LEVEL / tests
+            sure |= beside & (tail[k] < LEVEL)
+        resolved = (tapers + 1) / (2 * size * course.step_s)
+        sure &= _free(frequency, course, k, resolved, like=len(others) > 2)
+        if not sure.any():
+            continue
+        best = int(np.argmax(np.where(sure, amplitude[k] / least, 0)))
+        size_rad = float(amplitude[k, best])
+        if size_rad < COVERAGE * least[best]:  # it may be there for a part of the record
+            size_rad = _where_it_is(residual[k], float(frequency[best]) * course.step_s, tapers)
+        if size_rad + WIDTH * float(error[k, best]) > COVERAGE * least[best]:
+            lines.append(Line(k, float(frequency[best]), size_rad))
     return lines
+
+
+def _beside(amplitude: FloatArray, common: FloatArray, others: int) -> FloatArray:
+    """Return the chance of an amplitude in noise as of some others, whose median is common.
+
+    The square of one amplitude over the mean square of m others has Fisher's F distribution with 2
+    and 2m degrees of freedom; the mean is the median over the logarithm of 2.
+    """
+    ratio = np.log(2.0) * amplitude**2 / np.maximum(common**2, TINY)
+    return np.asarray((1 + ratio / others) ** -float(others), dtype=np.float64)
+
+
+def _tapers(course: Course, size: int) -> int:
+    """Return the number of tapers that tell half the motion's own frequency from a drift."""
+    cycles = [size * course.step_s / cycle_s(command, course.step_s) for command in course.command]
+    rhythms = [count for count in cycles if count > 0]
+    most = int(np.ceil(np.median(rhythms) / 2)) - 2 if rhythms else TAPERS
+    return min(max(most, FEWEST_TAPERS), TAPERS)
+
+
+def _where_it_is(residual: FloatArray, cycles: float, tapers: int) -> float:
+    """Return the amplitude of a line in the part of the record that has most of it.
+
+    Args:
+        cycles: Of the line a sample.
+        tapers: As of the test, which resolves so many cycles of the record.
+    """
+    steps = np.arange(residual.size)
+    turned = residual * np.exp(-2j * np.pi * cycles * steps)
+    blocks = min(max(int(cycles * residual.size / tapers), 2), FEWEST)
+    means = [2 * abs(np.mean(part)) for part in np.array_split(turned, blocks)]
+    return float(np.quantile(means, FOLLOWS))
 
 
 def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int) -> FloatArray:
@@ -95,12 +139,13 @@ def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int
     return np.maximum(least, ANGLE_MARGIN_RAD)
 
 
-def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolArray:
+def _free(
+    frequency: FloatArray, course: Course, k: int, resolved: float, *, like: bool
+) -> BoolArray:
     """Mark the frequencies that are neither drift nor, without like joints, the gait's.
 
     Stick and friction make motion at multiples of the gait's frequency, which like joints share.
     """
-    resolved = (TAPERS + 1) / (2 * course.t_s.size * course.step_s)
     free = frequency > 2 * resolved
     cycle = cycle_s(course.command[k], course.step_s)
     if np.isfinite(cycle) and not like:
@@ -109,7 +154,9 @@ def _free(frequency: FloatArray, course: Course, k: int, *, like: bool) -> BoolA
     return np.asarray(free, dtype=np.bool_)
 
 
-def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _tested(
+    residual: FloatArray, padded: int, tapers: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return amplitude of a line, its standard error, and chance of it without one.
 
     Each at all frequencies; |a|^2 / F estimates the variance of a part of a.
@@ -119,7 +166,7 @@ def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray, 
     power = np.zeros(padded // 2 + 1)
     weighted = np.zeros(padded // 2 + 1, dtype=np.complex128)
     sums = 0.0
-    for k in range(1, TAPERS + 1):
+    for k in range(1, tapers + 1):
         taper = np.sqrt(2 / (size + 1)) * np.sin(np.pi * k * steps / (size + 1))
         transformed: ComplexArray = np.fft.rfft(taper * residual, padded)
         total = float(taper.sum())
@@ -128,8 +175,8 @@ def _tested(residual: FloatArray, padded: int) -> tuple[FloatArray, FloatArray, 
         sums += total**2
     projected = np.abs(weighted) ** 2 / sums
     left = np.maximum(power - projected, TINY)
-    statistic = (TAPERS - 1) * projected / left
-    tail = (1 + statistic / (TAPERS - 1)) ** -(TAPERS - 1)
+    statistic = (tapers - 1) * projected / left
+    tail = (1 + statistic / (tapers - 1)) ** -(tapers - 1)
     amplitude = 2 * np.abs(weighted) / sums
     error = amplitude / np.sqrt(np.maximum(statistic, TINY))
     return amplitude, error, np.asarray(tail, dtype=np.float64)

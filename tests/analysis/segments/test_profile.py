@@ -115,7 +115,6 @@ def test_two_kinds_of_joints_are_found_with_a_weak_one_among_them(values, first)
     [
         np.full(9, 0.5),
         np.linspace(0.4, 0.6, 9),
-        np.repeat([0.4, 0.5], [4, 5]),
         0.5 - 0.2 * np.linspace(-1, 1, 9) ** 2,
         np.where(np.arange(9) == 4, 0.3, 0.5),
     ],
@@ -123,6 +122,15 @@ def test_two_kinds_of_joints_are_found_with_a_weak_one_among_them(values, first)
 def test_one_kind_is_not_divided(values):
     noise = 1e-3 * np.random.default_rng(2).standard_normal(values.size)
     assert split_of(values + noise, 0.02) is None
+
+
+def test_two_batches_one_behind_the_other_are_two_kinds():
+    noise = 0.002 * np.random.default_rng(1).normal(size=13)
+    split = split_of(0.1 * (np.arange(13) > 5) + noise, 0.02)
+    assert split is not None
+    assert split.first.tolist() == list(range(6))
+    decay = np.exp(-np.arange(13.0))
+    assert split_of(decay + 0.1 * noise, 0.02) is None
 
 
 def test_below_the_margin_nobody_is_named():

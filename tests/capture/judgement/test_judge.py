@@ -225,6 +225,49 @@ def test_a_vibration_is_motion_besides_the_command(chain):
     assert found.amplitude_rad == pytest.approx(0.1, rel=0.1)
 
 
+def test_a_line_at_half_the_pace_of_few_cycles_is_told_from_a_drift(chain):
+    chain.position[BROKEN] += 0.05 * np.sin(OMEGA / 2 * chain.t)
+    (found,) = judge(chain.motions()).extra
+    assert found.joint == "j4"
+    assert found.frequency_hz == pytest.approx(OMEGA / 4 / np.pi, abs=0.02)
+    assert found.amplitude_rad == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_vibration_of_a_part_of_the_record_has_its_own_amplitude(chain):
+    chain.position[BROKEN] += 0.02 * np.sin(2 * np.pi * 5.3 * chain.t) * (chain.t < 9)
+    found = judge(chain.motions())
+    stated = [each.joint for each in (*found.extra, *found.changes)]
+    assert stated
+    assert {*stated} == {"j4"}
+    for each in found.extra:
+        assert each.amplitude_rad == pytest.approx(0.02, rel=0.1)
+
+
+def test_more_noise_tells_less_of_gain_and_lag(chain):
+    later = chain.t > 7
+    chain.position[BROKEN] += 0.04 * chain.rng.normal(size=chain.t.size) * later
+    (found,) = judge(chain.motions()).changes
+    assert (found.joint, found.quantity) == ("j4", "noise")
+
+
+def test_a_zero_that_drifts_is_no_gain(chain):
+    chain.position[BROKEN] += 0.12 * (chain.t / chain.t[-1] - 0.5)
+    found = judge(chain.motions())
+    assert found.apart == found.faults == ()
+    (change,) = found.changes
+    assert (change.joint, change.quantity) == ("j4", "drift")
+    assert change.change == pytest.approx(0.12, rel=0.1)
+
+
+def test_two_kinds_of_servos_are_no_reason_to_doubt_the_names():
+    chain = Chain(15, step=-2 * np.pi / 15)
+    rear = np.arange(15) > 6
+    late = GAIN * 0.4 * np.sin(OMEGA * chain.t - 2 * np.pi / 15 * np.arange(15)[:, None] - 3 * LAG)
+    chain.position[rear] = 0.95 * late[rear]
+    found = judge(chain.motions())
+    assert (found.naming, found.faults) == ("", ())
+
+
 def test_swapped_cables_name_both(chain):
     chain.position[[3, 4]] = chain.position[[4, 3]]
     found = chain.judged()
