@@ -183,7 +183,8 @@ def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blo
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
-        return compared and _reaches(run, 2 * NOISE_MARGIN if alone else NOISE_MARGIN)
+        margin = 2 * NOISE_MARGIN if alone else NOISE_MARGIN
+        return compared and not blocks.swept[k] and _reaches(run, margin)
     lost = float(blocks.lost_rad[k]) if alone else 0.0
     if quantity in ("offset", "drift"):
         return _reaches(run, ANGLE_MARGIN_RAD) and abs(run.change) > lost

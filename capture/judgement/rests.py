@@ -1,9 +1,10 @@
 """Where a joint rests off its command, as soft servos under load do.
 
-The command rests where it moves less than an encoder would show for longer than the settling; the
-mean of the position less the command there, over the rests of a session, is the rest's error. Of a
-command that never rests it is how far the response is from the command at the command's median. It
-is a difference, no fault: proportional control without an integral part leaves it.
+The command rests where it has moved less than an encoder would show for longer than the settling,
+and than the slowest servo's time constant; the mean of the position less the command there, over
+the rests of a session, is the rest's error. Of a command that never rests it is how far the
+response is from the command at the command's median. It is a difference, no fault: proportional
+control without an integral part leaves it.
 """
 
 from __future__ import annotations
@@ -13,13 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import FloatArray
-from .exposure import Exposure, responds
-from .levels import LARGEST_REST_RAD
-from .motion import Course
+from .exposure import Exposure, responds, window_ranges
+from .levels import LARGEST_REST_RAD, LEAST_RANGE_RAD, QUARTER
+from .motion import Course, runs_of
+from .response import SLOWEST_S
 from .stillness import Stillness
-
-RESTING = 1e-3
-"""Share of the command's range within which it rests: a step of a 10-bit servo."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +61,17 @@ def _middle(course: Course, exposure: Exposure, k: int) -> float:
 def _rests(course: Course, exposure: Exposure, stillness: Stillness, k: int) -> list[float]:
     """Return the mean error of each rest, its beginning left out [rad]."""
     command = course.command[k]
-    moves = np.abs(np.diff(command, prepend=command[0])) > RESTING * np.ptp(command)
-    ends = np.flatnonzero(np.diff(np.concatenate([[True], moves, [True]]).astype(np.int8)))
-    settled = int(np.ceil(exposure.settling_s[k] / course.step_s)) + 1
+    longest_s = max(float(exposure.settling_s[k]), SLOWEST_S)
+    settled = min(int(np.ceil(longest_s / course.step_s)) + 1, command.size)
+    still = np.zeros(command.size, dtype=np.bool_)
+    # A slow gait moves little from step to step near its turns, and doesn't rest there.
+    still[settled - 1 :] = window_ranges(command, [settled])[0] <= LEAST_RANGE_RAD
     off: list[float] = []
-    for first, last in ends.reshape(-1, 2).tolist():
-        if last - first >= 2 * settled:
-            there = slice(first + settled, last)
+    for first, last in runs_of(still):
+        if last - first >= QUARTER * settled:
+            there = slice(first, last)
             kept = course.present[k, there] & ~stillness.stands[k, there]
             error: FloatArray = (course.position[k] - command)[there][kept]
-            if error.size >= settled:
+            if error.size:
                 off.append(float(np.mean(error)))
     return off

@@ -316,3 +316,23 @@ def test_a_zero_that_drifts_is_a_drift(chain):
 
 def test_every_kind_says_where_it_lies():
     assert {about for about, _ in KINDS.values()} == {"mechanics", "wiring", "sensor", "record"}
+
+
+def test_a_slow_gait_rests_at_none_of_its_turns():
+    t = np.arange(0, 60, 0.01)
+    phase = 2 * np.pi * t / 7.5 - 0.5 * np.arange(6)[:, None]
+    motions = [
+        JointMotion(f"j{k}", Samples(t, 0.6 * np.sin(x)), Samples(t, 0.5 * np.sin(x - 0.1)))
+        for k, x in enumerate(phase)
+    ]
+    assert judge(motions).rests == ()
+
+
+def test_a_tooth_that_slips_is_seen_in_a_small_motion():
+    chain = Chain()
+    for values in (chain.command, chain.true, chain.position):
+        values *= 0.05
+    chain.position[BROKEN] += 0.3 * (chain.t > 9)
+    (found,) = judge(chain.motions()).changes
+    assert (found.joint, found.quantity) == ("j4", "offset")
+    assert found.change == pytest.approx(0.3, rel=0.02)
