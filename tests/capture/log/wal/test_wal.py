@@ -1,6 +1,7 @@
 """The write-ahead log: what goes in comes out, and the life of its segments."""
 
 import random
+import shutil
 import struct
 import zlib
 
@@ -77,6 +78,22 @@ def test_a_message_longer_than_a_segment_has_one_of_its_own(tmp_path):
         for payload in (b"a", long, b"", long, b"b"):
             wal.append(1, 0, 0, 0, payload)
     assert payloads(tmp_path / "w") == [b"a", long, b"", long, b"b"]
+
+
+def test_a_spare_segment_that_is_too_small_is_removed(tmp_path):
+    with WriteAheadLog(tmp_path / "w", segment_size=4096) as wal:
+        spare = tmp_path / "w" / "000002.seg"
+        wait_for(spare.exists, "the spare segment")
+        wal.append(1, 0, 0, 0, bytes(100_000))
+        assert not spare.exists()
+        assert (tmp_path / "w" / "000003.seg").exists()
+
+
+def test_a_log_whose_folder_is_gone_ends_where_nothing_is_to_be_kept(tmp_path):
+    wal = WriteAheadLog(tmp_path / "w")
+    shutil.rmtree(tmp_path / "w")
+    wal.close()
+    assert not (tmp_path / "w").exists()
 
 
 @pytest.mark.parametrize(

@@ -165,6 +165,7 @@ def test_headers_are_whole_or_none():
     assert len(packed) == 64
     assert SegmentHeader.unpack(packed) == header
     assert SegmentHeader.unpack(packed[:-1]) is None
+    assert SegmentHeader.unpack(packed + b"\0") is None
     for at in range(52):
         broken = bytearray(packed)
         broken[at] ^= 1
