@@ -73,7 +73,9 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     lines: list[Line] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
-        common = np.median(amplitude[others], axis=0) if len(others) > 2 else 0.0
+        common = np.zeros(frequency.size)
+        if len(others) > 2:
+            common = np.asarray(np.median(amplitude[others], axis=0), dtype=np.float64)
         least = _least_rad(frequency, course, exposure, k)
         sure = (tail[k] < LEVEL / tests) & (amplitude[k] > NEIGHBOURS * common)
         if len(others) > 2:  # they show how much noise there is at a frequency
