@@ -62,13 +62,20 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     count, size = usable.shape
     # Between the frequencies of the record a line would lose up to a third of its amplitude.
     padded = 2 << size.bit_length()
-    tapers = _tapers(course, size)
     frequency = np.asarray(np.fft.rfftfreq(padded, course.step_s), dtype=np.float64)
+    few = _tapers(course, size)
+    slow = frequency <= (TAPERS + 1) / (size * course.step_s)
+    tapers = np.where(slow, few, TAPERS)
+    resolved = (tapers + 1) / (2 * size * course.step_s)
     residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
     amplitude, error, tail = np.empty((1 + 2, count, frequency.size))
     for k in range(count):
-        amplitude[k], error[k], tail[k] = _tested(residual[k], padded, tapers)
+        amplitude[k], error[k], tail[k] = _tested(residual[k], padded, TAPERS)
+        if few < TAPERS:
+            found = _tested(residual[k], padded, few)
+            for values, other in zip((amplitude, error, tail), found, strict=True):
+                values[k, slow] = other[slow]
     tests = count * size
     lines: list[Line] = []
     for k in range(count):
@@ -81,14 +88,15 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
         if len(others) > 2:  # they show how much noise there is at a frequency
             beside = _beside(amplitude[k], common, len(others)) < LEVEL / tests
             sure |= beside & (tail[k] < LEVEL)
-        resolved = (tapers + 1) / (2 * size * course.step_s)
         sure &= _free(frequency, course, k, resolved, like=len(others) > 2)
         if not sure.any():
             continue
         best = int(np.argmax(np.where(sure, amplitude[k] / least, 0)))
         size_rad = float(amplitude[k, best])
         if size_rad < COVERAGE * least[best]:  # it may be there for a part of the record
-            size_rad = _where_it_is(residual[k], float(frequency[best]) * course.step_s, tapers)
+            size_rad = _where_it_is(
+                residual[k], float(frequency[best]) * course.step_s, tapers[best]
+            )
         if size_rad + WIDTH * float(error[k, best]) > COVERAGE * least[best]:
             lines.append(Line(k, float(frequency[best]), size_rad))
     return lines
@@ -142,7 +150,7 @@ def _least_rad(frequency: FloatArray, course: Course, exposure: Exposure, k: int
 
 
 def _free(
-    frequency: FloatArray, course: Course, k: int, resolved: float, *, like: bool
+    frequency: FloatArray, course: Course, k: int, resolved: FloatArray, *, like: bool
 ) -> BoolArray:
     """Mark the frequencies that are neither drift nor, without like joints, the gait's.
 
