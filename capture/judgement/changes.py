@@ -289,7 +289,7 @@ def _regressed(
     )
     weights[:, count < FULL * width] = 0
     weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
-    # A block tells by so much less as what is left in it is more than usual.
+    # The weight of a block falls as what is left in it exceeds the usual.
     squares = moments[:, TERMS, TERMS] - np.einsum("bi,bi->b", estimate, target)
     left = np.maximum(squares, 0) / np.maximum(count, 1)
     weights[:TERMS] /= np.maximum(left / max(_middle(left[count > 0]), TINY), 1)
