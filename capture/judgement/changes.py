@@ -115,7 +115,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     Returns:
         Those beyond the level and the size that matters, joint by joint.
     """
-    blocks = _blocks(course, exposure, usable & _runs(course, exposure))
+    blocks = _blocks(course, exposure, usable & _running(course, exposure))
     if blocks is None:
         return []
     best: dict[int, tuple[float, Jump]] = {}
@@ -141,7 +141,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     return [best[k][1] for k in sorted(best)]
 
 
-def _runs(course: Course, exposure: Exposure) -> BoolArray:
+def _running(course: Course, exposure: Exposure) -> BoolArray:
     """Mark the steps from the first motion of a command to the last one and its settling."""
     runs = np.zeros(course.t_s.size, dtype=np.bool_)
     begins, ends = (
