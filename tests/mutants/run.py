@@ -119,21 +119,22 @@ def drawn(seed, count, parts=None):
                 places.setdefault((mutant.path, mutant.line, mutant.column), []).append(mutant)
         share = count // len(parts) + (number < count % len(parts))
         some = rng.sample(sorted(places), min(share, len(places)))
-        chosen += [_planted(sorted(places[place]), rng) for place in some]
+        chosen += [one for place in some if (one := _planted(sorted(places[place]), rng))]
     return chosen
 
 
 def _planted(mutants, rng):
-    """Choose a mutant that can be planted: cosmic-ray replaces no exception of a dotted name."""
+    """Choose a mutant that cosmic-ray can plant: it replaces no exception of a dotted name."""
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
 
-    while True:
+    while mutants:
         one = rng.choice(mutants)
         with contextlib.suppress(AttributeError):
             mutate_code((ROOT / one.path).read_text(), get_operator(one.operator)(), one.occurrence)
             return one
         mutants = [other for other in mutants if other != one]
+    return None
 
 
 def tests_of(path):
