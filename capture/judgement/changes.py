@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from .exposure import LIKE_LAG_S, Exposure
@@ -225,6 +226,7 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
     joints = course.position.shape[0]
     values = np.zeros((len(QUANTITIES), joints, count))
     weights = np.zeros_like(values)
+    left = np.zeros((joints, count))
     lost = np.zeros(joints)
     for k in range(joints):
         residual = course.position[k] - exposure.fitted[k]
@@ -233,13 +235,35 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         level = float(exposure.fitted[k] @ there) / max(float(there.sum()), 1.0)
         residual, scatter = _tamed(residual, there, count, width)
         rows = np.stack([np.ones_like(rate), exposure.fitted[k] - level, -rate, residual])
-        values[:TERMS, k], weights[:, k] = _regressed(rows * there, rows, starts, width)
+        values[:TERMS, k], weights[:, k], left[k] = _regressed(rows * there, rows, starts, width)
         lost[k] = REST_ERRORS * _middle(scatter[weights[TERMS, k] > 0])
         # Below the usual noise no change is of interest.
         values[TERMS, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2) + EPS)
+    weights[:TERMS] /= _excess_noise(left, weights[TERMS], exposure)
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
     swept = tuple(is_sweep(command) for command in course.command)
     return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
+
+
+def _excess_noise(left: FloatArray, weights: FloatArray, exposure: Exposure) -> FloatArray:
+    """Return by how much what is left of a joint exceeds that of like joints in the same time.
+
+    Args:
+        left: Mean squares of k joints in b blocks, shape (k, b).
+        weights: Of their logarithms, shape (k, b).
+
+    Returns:
+        Ratios of mean squares, 1 or more, shape (k, b): against the joint's own usual one, and
+        without that of a few blocks, which a motion that no response fits may have.
+    """
+    noise, known = _without_common(np.log(left + EPS**2), weights, exposure)
+    for k in range(len(noise)):
+        if len(exposure.group(k)) < ENOUGH_LIKE:
+            noise[k] = 0.0
+            continue
+        noise[k] = np.where(known[k] > 0, noise[k] - _middle(noise[k, known[k] > 0]), 0.0)
+    lasting = median_filter(noise, (1, 2 * REST_ERRORS + 1), mode="nearest")
+    return np.exp(np.maximum(lasting, 0.0))
 
 
 def _middle(values: FloatArray) -> float:
@@ -268,8 +292,11 @@ def _tamed(
 
 def _regressed(
     weighted: FloatArray, rows: FloatArray, starts: IntArray, width: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return offset, gain and lag of each block, shape (q - 1, b), and weights, shape (q, b)."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return offset, gain and lag of each block, shape (q - 1, b), and weights, shape (q, b).
+
+    And the mean square of what is left, shape (b,).
+    """
     stop = int(starts[-1]) + width
     products = weighted[:, None, :stop] * rows[None, :, :stop]
     moments = np.moveaxis(np.add.reduceat(products, starts, axis=2), 2, 0)
@@ -289,11 +316,9 @@ def _regressed(
     )
     weights[:, count < FULL * width] = 0
     weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
-    # The weight of a block falls as what is left in it exceeds the usual.
     squares = moments[:, TERMS, TERMS] - np.einsum("bi,bi->b", estimate, target)
     left = np.maximum(squares, 0) / np.maximum(count, 1)
-    weights[:TERMS] /= np.maximum(left / max(_middle(left[count > 0]), TINY), 1)
-    return estimate.T, weights
+    return estimate.T, weights, left
 
 
 def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray) -> float:
