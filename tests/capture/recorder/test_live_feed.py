@@ -31,6 +31,20 @@ ROBOT = Attachment(
 DEFINITIONS = [SCHEMA, EVENTS, STATES, ROSOUT, RAW, FACTS, ROBOT]
 
 
+@given(st.lists(st.integers(1, 300), max_size=40), st.integers(1, 900))
+def test_groups_are_as_large_as_a_datagram_may_be(lengths, size):
+    definitions = live_wire.LiveDefinitions(0)
+    packed = [bytes(length) for length in lengths]
+    for number, one in enumerate(packed):
+        definitions.keep(Schema(number, "", "", b""), one)
+    groups = definitions.groups(size)
+    assert [one for group in groups for one in group] == packed
+    sizes = [sum(map(len, group)) for group in groups]
+    assert all(total <= size or len(group) == 1 for total, group in zip(sizes, groups, strict=True))
+    for total, following in zip(sizes, groups[1:], strict=False):
+        assert total + len(following[0]) > size
+
+
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "live.sock"

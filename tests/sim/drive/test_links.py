@@ -1,6 +1,7 @@
 """Links to a bus, and the ticks of a loop: what is read, sent and counted."""
 
 import itertools
+import socket
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from undulog.capture import load_robot
 from undulog.capture.common.errors import SourceError
 from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
+from undulog.sim.drive import links
 from undulog.sim.drive.links import find_virtual_robot, sent_text
 from undulog.sim.drive.loop import CommandEncoder, WallPace
 from undulog.sim.drive.python_can_bus import open_link
@@ -71,6 +73,14 @@ def test_a_bus_that_can_not_be_opened_says_why(tmp_path):
     with pytest.raises(SourceError) as never:  # without its driver it never can
         open_link(parse_address("can:nican:x"), Tally(lambda: 0))
     assert "can't open it" not in str(never.value)
+
+
+def test_a_server_that_ends_the_connection_at_an_unknown_word_is_no_virtual_robot():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with socket.create_connection(server.getsockname()) as ours:
+            theirs, _ = server.accept()
+            theirs.close()
+            assert links._identity(ours, b"so far") == (None, b"so far")
 
 
 def identifiers(arrays):

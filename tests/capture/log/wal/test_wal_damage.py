@@ -10,6 +10,7 @@ import struct
 import sys
 import tempfile
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,25 @@ def test_damage_in_between_costs_only_what_it_hit(tmp_path):
     first = rf"the first at byte {places[9]}"
     assert re.fullmatch(rf"000001.seg: \d+ bytes are no whole records, {first}", damage)
     assert missing == "5 messages are missing between those found"
+
+
+@pytest.mark.parametrize(("at", "value"), [(16, 4), (17, 0xA4)], ids=["kind", "mark"])
+def test_a_record_of_another_kind_or_mark_is_none_though_its_crc_fits(tmp_path, at, value):
+    folder = filled(tmp_path / "w", 10, segment_size=1 << 16)
+    segment = folder / "000001.seg"
+    raw = bytearray(segment.read_bytes())
+    place, following = record_places(raw)[4:6]
+    raw[place + at] = value
+    (length,) = struct.unpack_from("<I", raw, place + 4)
+    (salt,) = struct.unpack_from("<I", raw, 12)
+    crc = zlib.crc32(raw[place + 4 : place + 40 + length], salt)
+    struct.pack_into("<I", raw, place, crc)
+    segment.write_bytes(raw)
+    recovery = recover(folder)
+    assert check_messages(list(recovery)) == sorted({*range(1, 11)} - {5})
+    assert recovery.warnings[0] == (
+        f"000001.seg: {following - place} bytes are no whole records, the first at byte {place}"
+    )
 
 
 def test_a_missing_segment_is_counted(tmp_path):

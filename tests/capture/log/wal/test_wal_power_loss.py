@@ -37,10 +37,19 @@ def check(disk, count):
         assert recovery.definitions == (CHANNEL,)
 
 
-def test_a_log_that_is_kept_at_its_end_is_on_the_disk(disk):
-    kept = "wal = opened(1 << 16); go_on(wal, 20); wal.close(); lose_power()"
-    disk.run(kept, disk.root / "w")
-    check(disk, 20)
+@pytest.mark.parametrize("count", [20, 2000])
+def test_a_log_that_is_kept_at_its_end_is_on_the_disk(disk, count):
+    """Few messages, and so many that a sync leaves out the page that is being written."""
+    kept = """
+wal = opened(1 << 20)
+go_on(wal, 10)
+wal._sync()
+go_on(wal, int(sys.argv[2]) - 10)
+wal.close()
+lose_power()
+"""
+    disk.run(kept, disk.root / "w", count)
+    check(disk, count)
 
 
 @pytest.mark.parametrize("syncs", [1, 2])
