@@ -76,11 +76,13 @@ def test_a_bus_that_can_not_be_opened_says_why(tmp_path):
 
 
 def test_a_server_that_ends_the_connection_at_an_unknown_word_is_no_virtual_robot():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        with socket.create_connection(server.getsockname()) as ours:
-            theirs, _ = server.accept()
-            theirs.close()
-            assert links._identity(ours, b"so far") == (None, b"so far")
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname()) as ours,
+    ):
+        theirs, _ = server.accept()
+        theirs.close()
+        assert links._identity(ours, b"so far") == (None, b"so far")
 
 
 def identifiers(arrays):
