@@ -130,7 +130,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
 
     for q, quantity in enumerate(QUANTITIES):
         values, weights = _without_common(blocks.values[q], blocks.weights[q], exposure)
-        values, weights = without_single(values, weights), limited_weights(weights)
+        weights = limited_weights(without_single(values, weights))
         rho = correlation_of(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
         for k, (value, weight) in enumerate(zip(values, weights, strict=True)):
@@ -240,6 +240,8 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
         # Below the usual noise no change is of interest.
         values[TERMS, k] = np.log(np.hypot(scatter, exposure.rest_rad[k] / 2) + EPS)
     weights[:TERMS] /= _excess_noise(left, weights[TERMS], exposure)
+    best = np.quantile(weights, FULL, axis=2, keepdims=True)
+    weights[weights < INFORMED * best] = 0
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
     swept = tuple(is_sweep(command) for command in course.command)
     return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
@@ -315,7 +317,6 @@ def _regressed(
         [1 / np.maximum(np.diagonal(inverse, axis1=1, axis2=2).T, TINY), [count]]
     )
     weights[:, count < FULL * width] = 0
-    weights[weights < INFORMED * np.quantile(weights, FULL, axis=1, keepdims=True)] = 0
     squares = moments[:, TERMS, TERMS] - np.einsum("bi,bi->b", estimate, target)
     left = np.maximum(squares, 0) / np.maximum(count, 1)
     return estimate.T, weights, left

@@ -43,7 +43,8 @@ class Exposure:
         like: Group of joints like it, shape (k,); joints of no group have numbers of their own.
         rest_rad: Rest error [rad], shape (k,).
         least_rad: Motion that has to be asked for to judge a joint [rad], shape (k,): three rest
-            errors, and what a healthy joint may lose besides what its own response leaves.
+            errors, and what a healthy joint may lose besides what its own response leaves; where
+            there are like joints, half of its command and six rest errors of two thirds of them.
         settling_s: Delay and settling of healthy joints [s], shape (k,).
     """
 
@@ -81,7 +82,7 @@ def exposure_of(
         fitted[k] = response.offset_rad + response.gain * filtered[k].output(response)[0]
         residual[k] = course.position[k] - fitted[k]
         lost[k] = _lost_motion(residual[k][course.present[k]])
-    rest = np.empty(len(motions))
+    rest, widest = np.empty((2, len(motions)))
     for k, response in enumerate(responses):
         group = [j for j, number in enumerate(like) if number == like[k]]
         sound = [responses[j] for j in group if responds(responses[j])]
@@ -95,10 +96,15 @@ def exposure_of(
         pool = group if len(group) >= ENOUGH_LIKE else others
         pooled = float(np.median(lost[pool])) if pool else LARGEST_REST_RAD
         rest[k] = min(pooled, LARGEST_REST_RAD)
+        most = float(np.quantile(lost[pool], WHOLE)) if len(group) >= ENOUGH_LIKE else np.inf
+        widest[k] = min(most, LARGEST_REST_RAD)
         known = sound or [r for r in responses if responds(r)]
         settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
     own = np.minimum(lost, LARGEST_REST_RAD)
-    least = np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own)
+    # Of like joints it is known how much of the motion of one that is asked for little rests and
+    # noise may hide.
+    known = np.maximum(2 * REST_ERRORS * widest, HALF * np.ptp(course.command, axis=1))
+    least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own), known)
     settling += course.step_s
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
 

@@ -21,7 +21,6 @@ from .changes import SHORTEST_S, Jump, find_jumps
 from .exposure import Exposure, agrees, exposure_of, median_response, responds
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .levels import (
-    ENOUGH_LIKE,
     FEWEST,
     FOLLOWS,
     HALF,
@@ -82,10 +81,8 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
     names = [motion.name for motion in driven]
     exposed: BoolArray = np.any(stillness.exposed, axis=1)
     usable[[name in faults for name in names]] = False
-    alike = [len(exposure.group(k)) >= ENOUGH_LIKE for k in range(len(driven))]
-    # Of like joints it is known how much of a motion rests and noise may hide.
-    least = np.where(alike, 2 * REST_ERRORS * exposure.rest_rad, LARGEST_REST_RAD)
-    asked: BoolArray = np.ptp(course.command, axis=1) > np.minimum(least, LARGEST_REST_RAD)
+    least = np.minimum(exposure.least_rad, LARGEST_REST_RAD)
+    asked: BoolArray = np.ptp(course.command, axis=1) > least
     jumps = find_jumps(course, exposure, usable & asked[:, None])
     for jump in [jump for jump in jumps if _ends(course, exposure, jump)]:
         like = [driven[j] for j in exposure.group(jump.joint)]

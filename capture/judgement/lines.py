@@ -156,7 +156,8 @@ def _free(
 
     Stick and friction make motion at multiples of the gait's frequency, which like joints share.
     """
-    free = frequency > 2 * resolved
+    # Three cycles where like joints show how much drift there is, or else four.
+    free = frequency > (REST_ERRORS / 2 if like else 2) * resolved
     cycle = cycle_s(course.command[k], course.step_s)
     if np.isfinite(cycle) and not like:
         harmonic = np.round(frequency * cycle)

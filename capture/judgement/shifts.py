@@ -45,20 +45,21 @@ class Shift:
 
 
 def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Replace a block that is far from both its neighbours by their median: alone it is no change.
+    """Return weights without those of a block that is far from both its neighbours.
 
-    Far is beyond :data:`TAME` robust standard deviations of what blocks differ from that median.
+    Alone it is no change. Far is beyond :data:`TAME` robust standard deviations of what blocks
+    differ from the median of three.
     """
-    result = values.copy()
-    for row, weight in zip(result, weights, strict=True):
+    result = weights.copy()
+    for row, weight in zip(values, result, strict=True):
         known = np.flatnonzero(weight > 0)
         if known.size >= FEWEST:
             inner = row[known]
             middle = np.median([inner[:-2], inner[1:-1], inner[2:]], axis=0)
-            middle = np.concatenate([middle[:1], middle, middle[-1:]])
-            away = np.abs(inner - middle)
-            far = away > TAME * ROBUST * np.median(away[away > 0]) if away.any() else away > 0
-            row[known] = np.where(far, middle, inner)
+            away = np.abs(inner[1:-1] - middle)
+            if away.any():
+                far = away > TAME * ROBUST * np.median(away[away > 0])
+                weight[known[1:-1][far]] = 0.0
     return result
 
 

@@ -39,11 +39,24 @@ def test_windows_cover_their_samples():
 
 def test_a_joint_that_was_hardly_asked_to_move_is_not_judged():
     """By less than what a healthy joint may lose, a dead joint looks like a healthy one."""
-    judgement = judge(joints(LARGEST_REST_RAD / 3, still=[2]))
+    judgement = judge(joints(LARGEST_REST_RAD / 3, still=[2], noise_rad=0.01))
     assert judgement.faults == ()
     names = [name for name, _ in judgement.unexposed]
     assert "j2" in names
     assert dict(judgement.unexposed)["j2"] == pytest.approx(2 * LARGEST_REST_RAD / 3, rel=0.01)
+
+
+def test_like_joints_show_that_a_small_motion_can_be_followed():
+    judgement = judge(joints(LARGEST_REST_RAD / 3, still=[2]))
+    assert [fault.joint for fault in judgement.faults] == ["j2"]
+    assert judgement.unexposed == ()
+
+
+def test_an_unlike_joint_is_not_judged_by_a_small_motion():
+    alone = joints(LARGEST_REST_RAD / 3, still=[2])[:3]
+    judgement = judge(alone)
+    assert judgement.faults == ()
+    assert [name for name, _ in judgement.unexposed] == ["j0", "j1", "j2"]
 
 
 def test_a_joint_that_had_to_move_and_stood_is_accused_with_its_evidence():

@@ -233,6 +233,16 @@ def test_a_line_at_half_the_pace_of_few_cycles_is_told_from_a_drift(chain):
     assert found.amplitude_rad == pytest.approx(0.05, rel=0.1)
 
 
+@pytest.mark.parametrize("cycles", [7.4, 7.9])
+def test_half_the_pace_of_seven_cycles_is_no_drift_where_like_joints_lack_it(chain, cycles):
+    chain.position[BROKEN] += 0.05 * np.sin(OMEGA / 2 * chain.t)
+    count = int(cycles * 2 * np.pi / OMEGA * RATE)
+    chain.t = chain.t[:count]
+    chain.command, chain.position = chain.command[:, :count], chain.position[:, :count]
+    (found,) = judge(chain.motions()).extra
+    assert (found.joint, found.frequency_hz) == ("j4", pytest.approx(OMEGA / 4 / np.pi, abs=0.03))
+
+
 def test_a_vibration_of_a_part_of_the_record_has_its_own_amplitude(chain):
     chain.position[BROKEN] += 0.02 * np.sin(2 * np.pi * 5.3 * chain.t) * (chain.t < 9)
     found = judge(chain.motions())

@@ -45,7 +45,7 @@ def drawn(rng, rho, joints=8, blocks=40):
 
 
 def found(values, weights):
-    values, weights = without_single(values, weights), limited_weights(weights)
+    weights = limited_weights(without_single(values, weights))
     rho = correlation_of(values, weights)
     tests = 4 * len(values)
     pairs = zip(values, weights, strict=True)
