@@ -26,6 +26,7 @@ from .levels import (
     HALF,
     LARGEST_REST_RAD,
     LEAST_RANGE_RAD,
+    NEGLIGIBLE,
     QUARTER,
     REST_ERRORS,
     TINY,
@@ -275,7 +276,7 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
 
     Over such times a zero that moved is a single step.
     """
-    if exposure.responses[k].explained >= HALF:
+    if exposure.responses[k].explained >= HALF or _vibrates(course, exposure, k):
         return False
     steps = max(1, int(exposure.settling_s[k] / course.step_s))
     moved, asked = (
@@ -286,6 +287,17 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
     power = float(np.std(moved[inside]) * np.std(asked[inside]))
     covariance = float(np.cov(moved[inside], asked[inside])[0, 1])
     return power == 0 or abs(covariance) < HALF * power
+
+
+def _vibrates(course: Course, exposure: Exposure, k: int) -> bool:
+    """Return whether most of a joint's own motion is at one frequency that its command lacks."""
+    both = np.stack([course.position[k] - exposure.fitted[k], course.command[k]])
+    both -= both.mean(axis=1, keepdims=True)
+    taper = np.sin(np.pi * (np.arange(both.shape[1]) + HALF) / both.shape[1])
+    power = np.abs(np.fft.rfft(taper * both, axis=1)) ** 2
+    peak = int(np.argmax(power[0]))  # a line between two frequencies is in four of them
+    left, asked = power[:, max(peak - 2, 0) : peak + 2 + 1].sum(axis=1) / power.sum(axis=1)
+    return bool(left > HALF and asked < NEGLIGIBLE)
 
 
 def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:

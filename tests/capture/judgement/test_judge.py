@@ -233,6 +233,17 @@ def test_a_line_at_half_the_pace_of_few_cycles_is_told_from_a_drift(chain):
     assert found.amplitude_rad == pytest.approx(0.05, rel=0.1)
 
 
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_vibration_larger_than_the_motion_is_no_noise(chain, noisy):
+    for values in (chain.command, chain.position, chain.true):
+        values *= 0.1
+    line = 0.06 * np.sin(2 * np.pi * 6.1 * chain.t)
+    chain.position[BROKEN] += chain.rng.permutation(line) if noisy else line
+    found = judge(chain.motions())
+    assert [fault.joint for fault in found.faults] == ["j4"] * noisy
+    assert [line.joint for line in found.extra] == ["j4"] * (not noisy)
+
+
 @pytest.mark.parametrize("cycles", [7.4, 7.9])
 def test_half_the_pace_of_seven_cycles_is_no_drift_where_like_joints_lack_it(chain, cycles):
     chain.position[BROKEN] += 0.05 * np.sin(OMEGA / 2 * chain.t)
