@@ -291,13 +291,19 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
 
 def _vibrates(course: Course, exposure: Exposure, k: int) -> bool:
     """Return whether most of a joint's own motion is at one frequency that its command lacks."""
-    both = np.stack([course.position[k] - exposure.fitted[k], course.command[k]])
-    both -= both.mean(axis=1, keepdims=True)
-    taper = np.sin(np.pi * (np.arange(both.shape[1]) + HALF) / both.shape[1])
-    power = np.abs(np.fft.rfft(taper * both, axis=1)) ** 2
-    peak = int(np.argmax(power[0]))  # a line between two frequencies is in four of them
-    left, asked = power[:, max(peak - 2, 0) : peak + 2 + 1].sum(axis=1) / power.sum(axis=1)
-    return bool(left > HALF and asked < NEGLIGIBLE)
+    own, asked = (
+        _power(values) for values in (course.position[k] - exposure.fitted[k], course.command[k])
+    )
+    peak = int(np.argmax(own))
+    near = slice(max(peak - 2, 0), peak + 2 + 1)  # a line between two frequencies is in four
+    shares = [float(power[near].sum()) / max(float(power.sum()), TINY) for power in (own, asked)]
+    return shares[0] > HALF and shares[1] < NEGLIGIBLE
+
+
+def _power(values: FloatArray) -> FloatArray:
+    """Return the power of values about their mean at each frequency of the record."""
+    taper = np.sin(np.pi * (np.arange(values.size) + HALF) / values.size)
+    return np.asarray(np.abs(np.fft.rfft(taper * (values - values.mean()))) ** 2, dtype=np.float64)
 
 
 def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:
