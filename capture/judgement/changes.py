@@ -295,9 +295,11 @@ def _tamed(
 def _regressed(
     weighted: FloatArray, rows: FloatArray, starts: IntArray, width: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return offset, gain and lag of each block, shape (q - 1, b), and weights, shape (q, b).
+    """Regress the residual in each block.
 
-    And the mean square of what is left, shape (b,).
+    Returns:
+        Offset, gain and lag, shape (q - 1, b), weights, shape (q, b), and the mean square of what
+        is left, shape (b,).
     """
     stop = int(starts[-1]) + width
     products = weighted[:, None, :stop] * rows[None, :, :stop]

@@ -82,7 +82,8 @@ def exposure_of(
         fitted[k] = response.offset_rad + response.gain * filtered[k].output(response)[0]
         residual[k] = course.position[k] - fitted[k]
         lost[k] = _lost_motion(residual[k][course.present[k]])
-    rest, widest = np.empty((2, len(motions)))
+    rest = np.empty(len(motions))
+    of_like = np.full(len(motions), np.inf)  # what like joints show to be enough
     for k, response in enumerate(responses):
         group = [j for j, number in enumerate(like) if number == like[k]]
         sound = [responses[j] for j in group if responds(responses[j])]
@@ -96,15 +97,13 @@ def exposure_of(
         pool = group if len(group) >= ENOUGH_LIKE else others
         pooled = float(np.median(lost[pool])) if pool else LARGEST_REST_RAD
         rest[k] = min(pooled, LARGEST_REST_RAD)
-        most = float(np.quantile(lost[pool], WHOLE)) if len(group) >= ENOUGH_LIKE else np.inf
-        widest[k] = min(most, LARGEST_REST_RAD)
+        if len(group) >= ENOUGH_LIKE:
+            usual = float(np.quantile(lost[group], WHOLE))
+            of_like[k] = max(2 * REST_ERRORS * usual, HALF * float(np.ptp(course.command[k])))
         known = sound or [r for r in responses if responds(r)]
         settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
     own = np.minimum(lost, LARGEST_REST_RAD)
-    # Of like joints it is known how much of the motion of one that is asked for little rests and
-    # noise may hide.
-    known = np.maximum(2 * REST_ERRORS * widest, HALF * np.ptp(course.command, axis=1))
-    least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own), known)
+    least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own), of_like)
     settling += course.step_s
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
 

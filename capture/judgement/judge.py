@@ -26,14 +26,13 @@ from .levels import (
     HALF,
     LARGEST_REST_RAD,
     LEAST_RANGE_RAD,
-    NEGLIGIBLE,
     QUARTER,
     REST_ERRORS,
     TINY,
     WHOLE,
     WIDTH,
 )
-from .lines import find_lines
+from .lines import find_lines, vibrates
 from .motion import Course, JointMotion, course_of, cycle_s, rises_of, runs_of
 from .naming import Kind, Naming, Verdict, in_words, permutation_of
 from .record import record_faults
@@ -276,7 +275,7 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
 
     Over such times a zero that moved is a single step.
     """
-    if exposure.responses[k].explained >= HALF or _vibrates(course, exposure, k):
+    if exposure.responses[k].explained >= HALF or vibrates(course, exposure, k):
         return False
     steps = max(1, int(exposure.settling_s[k] / course.step_s))
     moved, asked = (
@@ -287,23 +286,6 @@ def _is_incoherent(course: Course, exposure: Exposure, k: int) -> bool:
     power = float(np.std(moved[inside]) * np.std(asked[inside]))
     covariance = float(np.cov(moved[inside], asked[inside])[0, 1])
     return power == 0 or abs(covariance) < HALF * power
-
-
-def _vibrates(course: Course, exposure: Exposure, k: int) -> bool:
-    """Return whether most of a joint's own motion is at one frequency that its command lacks."""
-    own, asked = (
-        _power(values) for values in (course.position[k] - exposure.fitted[k], course.command[k])
-    )
-    peak = int(np.argmax(own))
-    near = slice(max(peak - 2, 0), peak + 2 + 1)  # a line between two frequencies is in four
-    shares = [float(power[near].sum()) / max(float(power.sum()), TINY) for power in (own, asked)]
-    return shares[0] > HALF and shares[1] < NEGLIGIBLE
-
-
-def _power(values: FloatArray) -> FloatArray:
-    """Return the power of values about their mean at each frequency of the record."""
-    taper = np.sin(np.pi * (np.arange(values.size) + HALF) / values.size)
-    return np.asarray(np.abs(np.fft.rfft(taper * (values - values.mean()))) ** 2, dtype=np.float64)
 
 
 def _is_opposite(course: Course, exposure: Exposure, k: int) -> bool:

@@ -20,7 +20,18 @@ import numpy as np
 
 from ..common.arrays import BoolArray, ComplexArray, FloatArray
 from .exposure import Exposure
-from .levels import ANGLE_MARGIN_RAD, COVERAGE, FEWEST, FOLLOWS, LEVEL, REST_ERRORS, TINY, WIDTH
+from .levels import (
+    ANGLE_MARGIN_RAD,
+    COVERAGE,
+    FEWEST,
+    FOLLOWS,
+    HALF,
+    LEVEL,
+    NEGLIGIBLE,
+    REST_ERRORS,
+    TINY,
+    WIDTH,
+)
 from .motion import Course, cycle_s
 
 TAPERS = FEWEST
@@ -100,6 +111,27 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
         if size_rad + WIDTH * float(error[k, best]) > COVERAGE * least[best]:
             lines.append(Line(k, float(frequency[best]), size_rad))
     return lines
+
+
+def vibrates(course: Course, exposure: Exposure, k: int) -> bool:
+    """Return whether most of what a joint does besides its response is one line.
+
+    It is at a frequency at which the joint's command doesn't move, and no drift or step.
+    """
+    own = _power(course.position[k] - exposure.fitted[k])
+    asked = _power(course.command[k])
+    peak = int(np.argmax(own))  # in cycles a record
+    near = slice(max(peak - 2, 0), peak + 2 + 1)  # a line between two frequencies is in four
+    own_share, asked_share = (
+        float(power[near].sum()) / max(float(power.sum()), TINY) for power in (own, asked)
+    )
+    return peak > REST_ERRORS and own_share > HALF and asked_share < NEGLIGIBLE
+
+
+def _power(values: FloatArray) -> FloatArray:
+    """Return the power of values about their mean at each whole number of cycles a record."""
+    taper = np.sin(np.pi * (np.arange(values.size) + HALF) / values.size)
+    return np.asarray(np.abs(np.fft.rfft(taper * (values - values.mean()))) ** 2, dtype=np.float64)
 
 
 def _beside(amplitude: FloatArray, common: FloatArray, others: int) -> FloatArray:

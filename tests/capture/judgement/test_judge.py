@@ -244,6 +244,17 @@ def test_a_vibration_larger_than_the_motion_is_no_noise(chain, noisy):
     assert [line.joint for line in found.extra] == ["j4"] * (not noisy)
 
 
+def test_a_joint_that_is_dead_at_another_angle_does_not_vibrate():
+    chain = Chain()
+    chain.command *= 0.08
+    chain.position *= 0.08
+    later = chain.t > 8
+    chain.position[BROKEN, later] = 0.2 + chain.rng.normal(0, 1e-3, later.sum())
+    (fault,) = judge(chain.motions()).faults
+    assert fault.joint == "j4"
+    assert "dead" in fault.kinds
+
+
 @pytest.mark.parametrize("cycles", [7.4, 7.9])
 def test_half_the_pace_of_seven_cycles_is_no_drift_where_like_joints_lack_it(chain, cycles):
     chain.position[BROKEN] += 0.05 * np.sin(OMEGA / 2 * chain.t)

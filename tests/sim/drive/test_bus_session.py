@@ -139,9 +139,9 @@ def test_all_frames_are_kept_and_what_was_sent_has_the_devices_time(written):
 
 
 def test_an_echo_of_a_joints_own_frame_is_no_angle_of_it(written):
-    told = frames((0x201, 10, 10), (0x202, 10, 10))
+    own = frames((0x201, 10, 10), (0x202, 10, 10))
     echo = frames((0x201, 20, 20), way=DIR_TX)
-    session = written(tick(1, received=[told]), tick(2, sent=echo), tick(20))
+    session = written(tick(1, received=[own]), tick(2, sent=echo), tick(20))
     states = session.joints("/joint_states")
     assert [states.signal(f"joint0{k}").t_ns.size for k in (1, 2)] == [1, 1]
 
