@@ -249,7 +249,7 @@ def test_a_joint_that_is_dead_at_another_angle_does_not_vibrate():
     chain.command *= 0.08
     chain.position *= 0.08
     later = chain.t > 8
-    chain.position[BROKEN, later] = 0.2 + chain.rng.normal(0, 1e-3, later.sum())
+    chain.position[BROKEN, later] = 0.2 + chain.rng.normal(0, 0.01, later.sum())
     (fault,) = judge(chain.motions()).faults
     assert fault.joint == "j4"
     assert "dead" in fault.kinds
