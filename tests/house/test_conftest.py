@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 
 from support.paths import ROOT
 from support.processes import run, wait_for
+from support.watcher import passed, scheduled
 
 TESTS = """
 import signal, subprocess, sys
@@ -75,14 +77,14 @@ def test_afterwards():
 MARKED = """
 import pytest
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_slow(): pass
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.built("part")
 def test_built(): pass
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.nightly
 def test_nightly(): pass
 """
@@ -118,6 +120,22 @@ def test_a_marker_leaves_its_tests_to_their_target(tmp_path, variable, wanted):
     inherited = {k: v for k, v in os.environ.items() if not k.endswith(("BUILD_PAGES", "NIGHTLY"))}
     done = run(*words, tmp_path, cwd=tmp_path, env=inherited | {f"UNDULOG_{variable}": "1"})
     assert set(re.findall(r"::test_(\w+)", done.stdout)) == wanted, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("ran_s", "waited_s", "counts_s"),
+    [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.1, 0.9, 0.1), (0.1, 1.8, 0.1), (1.9, 3.0, 1.0)],
+    ids=["asleep", "busy", "kept waiting", "two kept waiting", "busy and kept waiting"],
+)
+def test_only_time_in_which_a_run_could_go_on_counts(ran_s, waited_s, counts_s):
+    before, after = {"main": (5.0, 7.0)}, {"main": (5.0 + ran_s, 7.0 + waited_s), "new": (9.0, 9.0)}
+    assert passed(before, after) == pytest.approx(counts_s)
+
+
+def test_a_thread_s_time_on_a_processor_is_counted():
+    with subprocess.Popen(["yes"], stdout=subprocess.DEVNULL) as process:
+        wait_for(lambda: sum(ran for ran, _ in scheduled([process.pid]).values()) > 0.05, "work")
+        process.kill()
 
 
 @pytest.mark.nightly

@@ -4,9 +4,11 @@ It is a process of its own, so that it also ends a run whose interpreter is held
 
 Usage: ``watcher.py STDERR RUN``: the handle of the run's standard error and its process. Lines on
 standard input: ``SECONDS NAME`` begins a wait, an empty one ends it. Time counts by the watcher's
-own looks, so that a computer that slept is no reason.
+own looks, so that a computer that slept is no reason; and where the run could have gone on, but
+other programs had the processors, only its own processor time counts.
 """
 
+import contextlib
 import os
 import select
 import signal
@@ -38,6 +40,25 @@ def descendants(pid):
     return found - {pid, os.getpid()}
 
 
+def scheduled(pids):
+    """Return by thread the time on a processor and the time that it waited for one [s]."""
+    found = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):  # it has ended meanwhile, or the kernel doesn't count
+            for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+                ran, waited, _ = path.read_text().split()
+                found[path] = int(ran) * 1e-9, int(waited) * 1e-9
+    return found
+
+
+def passed(before, after):
+    """Return how much of a look counts [s]: all but what threads waited for a processor in it."""
+    both = [(*before[thread], *after[thread]) for thread in before.keys() & after.keys()]
+    ran = sum(new - old for old, _, new, _ in both)
+    waited = sum(new - old for _, old, _, new in both)
+    return min(max(ran, LOOK_S - waited), LOOK_S)
+
+
 def end(run, stderr, name, limit_s):
     """Print what stood still and the stacks, then kill the run and all that it has started."""
     os.write(stderr, f"\n{name} stood still for {limit_s:g} s; all stacks:\n".encode())
@@ -60,7 +81,7 @@ def end(run, stderr, name, limit_s):
 def main(stderr, run):
     """Watch a run until its pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is the run's own
-    name, left_s, limit_s, text = "", 0.0, 0.0, b""
+    name, left_s, limit_s, text, before = "", 0.0, 0.0, b"", {}
     while True:
         if select.select([0], [], [], LOOK_S)[0]:
             data = os.read(0, 65536)
@@ -70,8 +91,11 @@ def main(stderr, run):
             if lines:
                 seconds, _, name = lines[-1].decode().partition(" ")
                 left_s = limit_s = float(seconds or 0.0)
+                before = {}
         elif limit_s:
-            left_s -= LOOK_S
+            after = scheduled({run, *descendants(run)})
+            left_s -= passed(before, after)
+            before = after
             if left_s <= 0.0:
                 end(run, stderr, name, limit_s)
                 return
