@@ -171,6 +171,7 @@ MOST_SPANS = 4
 WHAT = {
     "sensor": "the sensor, not mechanics",
     "sensor or joint": "the sensor or the joint itself",
+    "sensor or limit": "the sensor or a limit of the servo",
     "limit": "a limit of the robot",
     "record": "the record, not mechanics",
 }

@@ -25,6 +25,7 @@ from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 _ABOUT = {
     "sensor": "Artefact of the sensor",
     "sensor or joint": "Sensor or joint",
+    "sensor or limit": "Sensor or limit",
     "record": "Artefact of the record",
     "limit": "At a limit",
 }

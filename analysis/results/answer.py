@@ -333,6 +333,10 @@ KINDS = {
     "wrapped": ("sensor", "are off by whole turns of a counter that wraps around"),
     "jump": ("sensor", "make steps that no joint can make"),
     "clipped": ("sensor", "have flat tops at the end of the sensor's range"),
+    "cut_off": (
+        "sensor or limit",
+        "have flat tops: all that the servo gives, or the sensor sees",
+    ),
     "wrong_sign": ("sensor or joint", "have the opposite sign"),
     "wrong_unit": ("sensor", "are larger or smaller by 180/pi: degrees for radians"),
     "scale_mismatch": ("sensor", "differ in scale from another measure of the same motion"),
@@ -373,7 +377,10 @@ class Artefact:
 
     @property
     def about(self) -> str:
-        """``sensor``, ``sensor or joint`` (positions alone can't tell), ``record`` or ``limit``."""
+        """``sensor``, ``sensor or joint`` (positions alone can't tell), ``record`` or ``limit``.
+
+        Also ``sensor or limit``, of efforts.
+        """
         return KINDS[self.flag][0]
 
     def falsifies(self, *quantities: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit
 from ..results.analysis import JointResult
-from ..results.answer import Artefact, NotFollowing
+from ..results.answer import Artefact, NotFollowing, overlapping
 from ..signals.columns import QUANTITIES, Columns, by_plane
 from ..signals.windows import Stretch
 from .examine import Chain, Findings, examine
@@ -28,6 +28,9 @@ _COMPARABLE = {"lost_samples"}
 _STANDING = frozenset({("position", "frozen"), ("position", "clipped"), ("effort", "stalled")})
 """Artefacts of a joint that stands; whether it had to move decides."""
 
+_REPEATED = _STANDING | {("position", "stale")}
+"""Artefacts that frames of made times show of what is sampled more slowly."""
+
 
 @dataclass(frozen=True)
 class Following:
@@ -36,10 +39,14 @@ class Following:
     Attributes:
         judgement: Of the joints, times from the session's start.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+        commanded: Joints with commands, which may hold still.
+        in_frames: Whether times were made from a frame rate, so that no joint is judged.
     """
 
     judgement: Judgement
     offsets: Mapping[str, FloatArray]
+    commanded: frozenset[str]
+    in_frames: bool
 
 
 def following(session: SessionView, columns: Columns, window: Stretch) -> Following:
@@ -50,9 +57,10 @@ def following(session: SessionView, columns: Columns, window: Stretch) -> Follow
         columns.names,
         (window.start_ns, window.stop_ns),
     )
-    # A frame of made times repeats what is sampled more slowly.
-    judgement = Judgement() if times_made(session) else judge(motions)
-    return Following(judgement, {m.name: _offsets(m) for m in motions if m.position.t_s.size > 1})
+    in_frames = times_made(session)
+    judgement = Judgement() if in_frames else judge(motions)
+    offsets = {m.name: _offsets(m) for m in motions if m.position.t_s.size > 1}
+    return Following(judgement, offsets, frozenset(m.name for m in motions), in_frames)
 
 
 def _offsets(motion: JointMotion) -> FloatArray:
@@ -72,19 +80,29 @@ def _offsets(motion: JointMotion) -> FloatArray:
 def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefact, ...]:
     """Leave out values that seem to stand where the joint follows its command all the same.
 
+    A joint that was not asked to move may stand, too; of one that doesn't follow for a while, what
+    stands at other times is left out.
+
     Args:
         follows: How the joints follow.
 
     Returns:
         The others, in their order.
     """
-    accused = {fault.joint for fault in follows.judgement.faults}
-    judged = {*follows.judgement.judged} - accused
-    return tuple(
-        artefact
-        for artefact in artefacts
-        if (artefact.quantity, artefact.flag) not in _STANDING or artefact.joint not in judged
-    )
+    judgement = follows.judgement
+    standing = _REPEATED if follows.in_frames else _STANDING
+    decided = bool(judgement.judged or judgement.unexposed or follows.in_frames)
+    faults = {fault.joint: fault.spans_s for fault in judgement.faults}
+    left: list[Artefact] = []
+    for one in artefacts:
+        if (one.quantity, one.flag) not in standing:
+            left.append(one)
+        elif one.joint in faults:
+            spans = [span for span in one.spans_s if overlapping(faults[one.joint], *span)]
+            left += [replace(one, spans_s=tuple(spans))] if spans else []
+        elif not (decided and one.joint in follows.commanded):
+            left.append(one)
+    return tuple(left)
 
 
 def not_following(follows: Following) -> tuple[NotFollowing, ...]:

@@ -68,6 +68,7 @@ def _warn_flags(
         meaning = {
             "sensor": f"an artefact of the sensor, not mechanics{nulls}",
             "sensor or joint": f"the sensor or the joint itself, see the answer{nulls}",
+            "sensor or limit": "the sensor or a limit of the servo",
             "record": "an artefact of the record, not mechanics",
             "limit": "a limit of the robot, not a fault of the sensor",
         }[about]
@@ -150,7 +151,6 @@ def measure_session(
         warn(finding.sentence)
     columns, left_out = without_breaks(session, columns, options, warn)
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
-    artefacts = find_artefacts(session, columns)
     stretch = choose_stretch(session, columns, options, warn)
     whole = recorded(session, columns, options)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
@@ -160,8 +160,9 @@ def measure_session(
     _warn_dropped(commands, responses, warn)
     session.forget()
     follows = following(session, columns, whole)
+    artefacts = unrefuted(find_artefacts(session, columns), follows)
     during = stretch.since(session.start_ns)
-    held = unrefuted([one for one in artefacts if one.within(*during)], follows)
+    held = tuple(one for one in artefacts if one.within(*during))
     session.forget()
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}

@@ -270,6 +270,9 @@ def _constant(effort: Series, span: Span) -> bool:
 GAP_SHARE = 1e-3
 """Less of a session without samples is no gap worth a word."""
 
+DRIVE = frozenset({"effort", "current", "voltage"})
+"""Their flat tops may be all that the servo gives."""
+
 MOST_RATE = 50.0
 """Rate that no joint of a robot without description exceeds [rad/s]."""
 
@@ -336,7 +339,7 @@ def _of_sensors(joint: _Joint) -> _Found:
         yield from _of_position(joint, joint.series["position"], tops["position"])
     for quantity, spans in tops.items():
         if spans:
-            yield quantity, "clipped", spans, ""
+            yield quantity, "cut_off" if quantity in DRIVE else "clipped", spans, ""
 
 
 def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Found:

@@ -98,6 +98,7 @@ class Said:
         not_decided: Whether the sentence leaves open whether or which joints differ.
         sentence: The sentence itself.
         refused: Why there is none, or empty.
+        doubted: Joints of whose position the analysis states that a sensor falsifies it.
     """
 
     accused: tuple[Accused, ...]
@@ -107,6 +108,7 @@ class Said:
     not_decided: bool
     sentence: str
     refused: str = ""
+    doubted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,9 @@ def stated(signals: Signals) -> Said:
         alike=bool(answer.alike),
         not_decided=not_decided,
         sentence=answer.sentence,
+        doubted=tuple(
+            one.joint for one in measured.analysis.artefacts if one.falsifies("position")
+        ),
     )
 
 

@@ -278,7 +278,9 @@ BY_DAY = {"so101/chirp_sweep", "so101/pick_place", "go2/traj_0", "kuka"}
     ],
 )
 def test_no_joint_of_a_sound_robot_is_accused(name):
-    assert stated(recordings()[name]()).accused == ()
+    said = stated(recordings()[name]())
+    assert said.accused == ()
+    assert said.doubted == ()
 
 
 @needs_recordings

@@ -64,7 +64,8 @@ def judged(
         undecidable: Whether it is as right to leave open which joints differ.
     """
     planted = {names[joint.joint]: joint for joint in joints}
-    accused = tuple(a.joint for a in statement.accused if a.joint not in planted)
+    blamed = (*(a.joint for a in statement.accused), *statement.doubted)
+    accused = tuple(dict.fromkeys(name for name in blamed if name not in planted))
     # Of a rest it is stated where the joint was; it is compared with no other.
     compared = [d for d in statement.different if d.quantity != "rest"]
     different = dict.fromkeys(d.joint for d in compared if d.joint not in planted)
