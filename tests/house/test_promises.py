@@ -23,7 +23,7 @@ GUARDS = {
     "No command reaches the bus beyond the step bound": (
         "sim/drive/test_gate_stall.py",
         "sim/drive/test_gate_confirmation.py",
-        "sim/drive/test_loop.py",
+        "sim/drive/test_loop_whole.py",
     ),
     "No input ends in a traceback or a signal": (
         "campaign/test_campaign.py",
