@@ -15,8 +15,6 @@ from support.written_sessions import write_commands
 from undulog import sim
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
-from undulog.capture.robot.model import Plane
-from undulog.sim.drive.in_process import FadingGait
 from undulog.sim.drive.motion import CommandReplay, RecordedCommands
 
 TOPICS = ("/joint_commands", "/joint_current", "/joint_voltage", "/gait", "/energy_ledger")
@@ -220,49 +218,6 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     assert commands.shape[1] - 1 - begun == 100  # within a second of robot's time
     # Smooth: no step is larger than that of the gait plus that of the fade, A (omega + S'max / T).
     assert np.abs(np.diff(commands[:, begun - 1 :])).max() <= 0.4 * (np.pi + 1.5) * 0.01
-
-
-def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
-    robot = make_robot(5, planar=True)
-    wave = sim.Serpentine({Plane.HORIZONTAL: sim.PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
-    own, faded = (
-        sim.SerpentineGait(wave, robot),
-        FadingGait(sim.SerpentineGait(wave, robot), robot, 0.5),
-    )
-    nothing = sim.Readings.nothing(robot)
-    for k in range(160):  # whatever the rounding of times: 0.5 s are 50 ticks
-        expected, tick = own.step(k / 100, nothing), faded.step(k / 100, nothing)
-        if k == 99:
-            faded.begin()
-        x = min(max((k - 100) / 50, 0.0), 1.0)
-        share = 1.0 - x * x * (3.0 - 2.0 * x)
-        np.testing.assert_allclose(tick.command, share * expected.command, atol=1e-8)
-        np.testing.assert_allclose(
-            tick.values, expected.values * [share, 1, 1, share, 1], atol=1e-8
-        )
-        assert tick.mode == ("walk" if k < 100 else "stop")
-        assert faded.at_rest == (k >= 150)
-
-
-class Adaptive:
-    """A gait that reports what a controller may: values of joints, and infinity."""
-
-    names = ("horizontal.A", "joint02.offset", "joint02.phase", "steer.offset", "steer.distance")
-
-    def step(self, time_s, readings):
-        del time_s, readings
-        return sim.GaitTick(np.full(4, 0.2), np.array([0.4, 0.1, 2.0, 0.3, np.inf]), "avoid", ())
-
-
-def test_fading_leaves_what_a_controller_reports_of_itself(make_robot):
-    robot = make_robot(5)
-    gait = FadingGait(Adaptive(), robot)
-    gait.begin()
-    first, half, last = (gait.step(t, sim.Readings.nothing(robot)) for t in (0.0, 0.5, 1.0))
-    assert first.values.tolist() == [0.4, 0.1, 2.0, 0.3, np.inf]
-    assert half.values == pytest.approx([0.2, 0.05, 2.0, 0.3, np.inf])
-    assert last.values.tolist() == [0.0, 0.0, 2.0, 0.3, np.inf]
-    assert half.command == pytest.approx(np.full(4, 0.1))
 
 
 def written(path, rows, names=("joint01", "joint02")):
