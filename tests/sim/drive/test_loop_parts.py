@@ -252,6 +252,13 @@ def test_a_stop_that_is_requested_again_ends_it_at_once():
     assert run.servo.taken[-1][0] < run.begun_ns + 64 * PERIOD_NS
 
 
+def test_a_terminal_is_looked_for_at_all_standard_streams(monkeypatch):
+    asked = []
+    monkeypatch.setattr("undulog.sim.drive.loop.os.isatty", asked.append)
+    assert not ConsoleWatch().gone()
+    assert asked == [0, 1, 2]
+
+
 def test_a_terminal_that_hangs_up_is_gone_and_its_streams_lead_nowhere(monkeypatch):
     master, slave = pty.openpty()
     plain, other = os.pipe()

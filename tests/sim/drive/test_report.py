@@ -1,11 +1,9 @@
 """What a drive over a bus says of itself: for people, for JSON, for the session."""
 
 import dataclasses
-import itertools
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from support.twin_chains import chain
@@ -14,7 +12,6 @@ from undulog.capture.sources.contract import parse_address
 from undulog.sim.drive.limits import gate_limits
 from undulog.sim.drive.loop import LoopTally
 from undulog.sim.drive.outcome import (
-    MUTE,
     DriveEnding,
     FaultKind,
     GateEvent,
@@ -132,27 +129,3 @@ def test_how_many_steps_may_be_on_their_way():
         "most_steps": "1",
     }
     assert unasked.facts()["confirmed_by"] == "nothing"
-
-
-def test_lateness_by_numpy():
-    assert jitter([]) is None
-    late_s = np.array([0.0, 1e-4, 1.1e-4, 2e-3, 0.02, 0.0201, 0.1, 0.2, 9.0])
-    found = jitter(late_s.tolist())
-    assert (found.ticks, found.worst_s) == (9, 9.0)
-    assert found.median_s == np.median(late_s)
-    assert found.p99_s == np.quantile(late_s, 0.99)
-    edges = np.array([0, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, np.inf]) * 1e-3
-    inside = [
-        int(np.sum((late_s <= high) & ((late_s > low) | ((low == 0) & (late_s == 0)))))
-        for low, high in itertools.pairwise(edges)
-    ]
-    assert list(found.counts) == inside
-    assert list(found.to_dict()["counts"])[::10] == ["<= 0.1 ms", "> 100 ms"]
-
-
-def test_faults_for_json():
-    assert FAULT.to_dict() == {
-        "kind": "current", "joint": "joint01", "value": 3.0, "limit": 1.4,
-    }  # fmt: skip
-    assert GateFault(FaultKind.BUS, "gone").to_dict()["joint"] is None
-    assert {FaultKind.BUS_OFF, FaultKind.BUS, FaultKind.STRANGER} == MUTE
