@@ -18,8 +18,9 @@ from support.simulated_clock import SimulatedClock
 from undulog.capture import load_robot
 from undulog.capture.common.errors import LogWriteError, SourceError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.messages.frames import DIR_RX, empty_frames
+from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, empty_frames
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.sources.events import BUS_OFF
 from undulog.sim.drive.feedback import Confirmation
 from undulog.sim.drive.gate import Gate
 from undulog.sim.drive.limits import Spacing, gate_limits
@@ -93,12 +94,15 @@ class Swing:
         return GaitTick(np.array([0.2 * np.sin(5.0 * time_s)]), np.empty(0), "walk", ())
 
 
-def drive(*, silent_s=(0.0, 0.0), duration_s=0.5, on_tick=None, stop=None, lost_after=None, **more):
+def drive(
+    *, silent_s=(0.0, 0.0), duration_s=0.5, on_tick=None, stop=None, lost_after=None,
+    unasked_at=None, listen_s=0.5, **more,
+):  # fmt: skip
     """Drive the servo; returns loop, gate, servo, and ticks."""
     time, ticks = SimulatedClock(), []
     servo = Servo(time, [time.now_ns + round(at_s * 1e9) for at_s in silent_s])
     servo.lost_after = lost_after
-    gate = Gate(Swing(), LIMITS, duration_s=duration_s, place=servo.place, listen_s=0.5)
+    gate = Gate(Swing(), LIMITS, duration_s=duration_s, place=servo.place, listen_s=listen_s)
     now_ns = time.clock.monotonic_ns
     loop = ControlLoop(
         gate,
@@ -112,6 +116,8 @@ def drive(*, silent_s=(0.0, 0.0), duration_s=0.5, on_tick=None, stop=None, lost_
 
     def each(tick):
         ticks.append(tick)
+        if tick.tick == unasked_at:
+            servo.answers += servo.answers[-1:]
         if on_tick is not None:
             on_tick(tick)
 
@@ -152,6 +158,12 @@ def test_it_asks_in_each_tick_and_commands_before_it_asks():
     assert len(run.gate._gait.readings.angle) == 1
 
 
+def test_where_nothing_was_measured_a_reply_is_expected_in_each_tick():
+    run = drive(listen_s=0.0)
+    assert run.loop._confirmation.armed == (1, 3, 8)
+    assert (run.gate.run_from, run.gate.outcome.how) == (1, DriveEnding.COMPLETE)
+
+
 def test_the_servo_is_where_it_was_commanded_to_be():
     run = drive()
     given = [tick.step.command[0] for tick in run.ticks if tick.step.command is not None]
@@ -174,6 +186,42 @@ def test_a_servo_that_stops_answering_is_asked_but_not_commanded():
     assert requests[:6] == [800, 810, 830, 870, 950, 1110]  # less and less often
     assert np.diff(requests).max() == 500
     assert run.loop.tally.late_s == [0.0] * len(run.ticks)
+
+
+def test_a_reply_that_is_lost_makes_requests_pause_and_is_no_silence():
+    run = drive(silent_s=(0.6, 0.605))
+    assert run.gate.outcome.how is DriveEnding.COMPLETE
+    assert (run.gate.held_ticks, run.loop.by_replies) == (0, True)
+    asked = {(at_ns - run.begun_ns) // PERIOD_NS for at_ns, word in run.servo.taken if word == 0x92}
+    # Sixteen rounds later it is clear; in twice three ticks no reply is late any more.
+    assert set(range(101)) - asked == set(range(77, 83))
+
+
+def test_joints_that_report_unasked_confirm_nothing_by_replies():
+    run = drive(unasked_at=70)
+    assert run.loop.by_replies is False
+    assert run.gate.outcome.how is DriveEnding.COMPLETE
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_trouble_on_the_bus_is_found_in_whatever_came(first):
+    error, usual = (empty_frames(1) for _ in range(2))
+    error["id_flags"], usual["id_flags"] = ERROR_FLAG | BUS_OFF, 0x7FF
+    time = SimulatedClock()
+
+    class Bus:
+        place = "can:bus"
+
+        def receive(self):
+            return [error, usual] if first else [usual, error]
+
+    gate = Gate(Swing(), LIMITS, duration_s=0.5, place="can:bus", listen_s=0.5)
+    pace = WallPace(Bus(), time.clock)
+    loop = ControlLoop(gate, ROBOT, Bus(), pace, spacing=None, confirmation=None)
+    assert loop.by_replies is False
+    with pytest.raises(SourceError, match="can:bus: no command was sent: bus-off: "):
+        loop.run(StopRequest(), list)
+    assert loop.tally.received == 2
 
 
 def test_what_the_bus_loses_before_the_first_command_is_raised_and_later_the_outcome():
