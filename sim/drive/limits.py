@@ -202,10 +202,10 @@ class Spacing:
         """
         if self._last is None:
             return np.zeros(count, dtype=np.int64)
-        need_s = float(np.max(np.abs(command - self._last) / self._rate, initial=0.0))
+        need_s = float(np.max(np.abs(command - self._last) / self._rate))
         before = self._sent_ns
         if len(before) != count:  # not the same frames: none of them earlier than all of those
-            before = np.full(count, before.max(initial=0))
+            before = np.full(count, before.max())
         earliest = before + math.ceil(need_s * NS)
         wait_s = (int(earliest.max()) - self._now_ns()) / NS
         if wait_s > 0.0:
@@ -324,7 +324,7 @@ class Ramp:
             rate: Greatest rates [rad/s], shape (m,).
         """
         self._start, self._way = start.copy(), target - start
-        self.duration_s = _PEAK * float(np.max(np.abs(self._way) / rate, initial=0.0))
+        self.duration_s = _PEAK * float(np.max(np.abs(self._way) / rate))
 
     def at(self, time_s: float) -> FloatArray:
         """The pose at a time.
@@ -368,7 +368,7 @@ class Ending:
         rest = np.clip(np.zeros_like(last), limits.lower, limits.upper)
         target = start if limits.on_fault is OnFault.HOLD else rest
         self._ramp = Ramp(start, target, limits.ramp_rate)
-        back_s = float(np.max(np.abs(start - last) / limits.rate, initial=0.0))
+        back_s = float(np.max(np.abs(start - last) / limits.rate))
         self.duration_s = back_s + self._ramp.duration_s + HOLD_S
 
     def at(self, time_s: float) -> FloatArray:
