@@ -44,7 +44,7 @@ class Own(Driver):
 @pytest.fixture
 def opened(monkeypatch):
     """Open a bus with a driver, without a thread that reads it; what it reads is ``read``."""
-    clock = SimulatedClock(now_ns=1000)
+    clock = SimulatedClock(now_ns=0)
     tally = Tally(lambda: clock.now_ns)
     monkeypatch.setattr(links, "time", SimpleNamespace(sleep=clock.clock.sleep))
 
@@ -133,7 +133,8 @@ def test_frames_are_sent_in_order_each_not_before_its_time(opened):
     frames = empty_frames(3)
     frames["id_flags"], frames["dlc"] = [0x101, 0x1ABCDEF | EXTENDED_FLAG, 0x7FF], [2, 8, 0]
     frames["data"] = np.arange(1, 9)
-    opened.clock.late_s = [3e-6]
+    assert bus.send(frames[:1]).tolist() == [0]  # at once
+    opened.clock.now_ns, opened.clock.late_s = 1000, [3e-6]
     times = bus.send(frames, np.array([500, 2000, 4000]))
     assert times.tolist() == [1000, 5000, 5000]  # the second one woke late
     assert times.dtype == np.int64
@@ -149,7 +150,7 @@ def test_frames_are_sent_in_order_each_not_before_its_time(opened):
         (0x1ABCDEF, True, bytes(range(1, 9)), 0.02),
         (0x7FF, False, b"", 0.02),
     ]
-    assert sent == [*expected, *expected[:2]]
+    assert sent == [expected[0], *expected, *expected[:2]]
     assert not any(message.is_remote_frame or message.is_fd for message, _ in opened.driver.sent)
 
 
