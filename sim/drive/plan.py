@@ -212,7 +212,7 @@ def _scenario(top: Table, folder: Path) -> Scenario | None:
         return load_scenario(name)
     if name and is_file(folder / name):
         return load_scenario(folder / name)
-    if name:  # a missing name is a fault already
+    if name or top.look("scenario")[1] == "":  # what is missing or no text is a fault already
         near = listed(scenario_names(), name)
         top.fault("scenario", f"a TOML file beside the plan, or one of {near}")
     return None
