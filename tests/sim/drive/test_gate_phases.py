@@ -44,7 +44,13 @@ def changes(bench):
 
 @pytest.mark.parametrize(
     ("pose", "ramps"),
-    [((0.0049,), False), ((0.0051,), True), ((0.0, 0.0051), True), ((-0.0049, 0.0049), False)],
+    [
+        ((0.0049,), False),
+        ((0.005,), False),
+        ((0.0051,), True),
+        ((0.0, 0.0051), True),
+        ((-0.0049, 0.0049), False),
+    ],
 )
 def test_a_first_pose_within_a_step_of_the_ramp_is_run_at_once(pose, ramps):
     bench = Bench(Still(*pose))

@@ -102,9 +102,11 @@ class Snake(VirtualRobotLink):
 class Recorder:
     """What is told to a recorder."""
 
+    dropped = 0
+
     def __init__(self, path, names):
         self.path, self.names, self.notes, self.values, self.closed = path, names, [], [], 0
-        self.taken, self.dropped, self.error = 17, 0, None
+        self.taken, self.error = 17, None
 
     def note(self, text, level="info"):
         self.notes.append((level, text))
@@ -196,41 +198,28 @@ def test_a_drive_in_lockstep_is_told_to_session_recorder_and_screen(stage):
         assert [one.data for _, one in session.messages("/gait/mode")] == ["walk", "turn"]
 
 
-def test_samples_that_a_recorder_did_not_take_are_told(stage, monkeypatch):
-    made = {}
-
-    def recorder(path, names):
-        one = Recorder(path, names)
-        one.dropped, one.error = made["dropped"], made["error"]
-        return one
-
-    for number, (dropped, error, expected) in enumerate(
-        ((3, None, "3 samples: the recorder was too slow"), (3, "it went", "it went"))
-    ):
-        made |= {"dropped": dropped, "error": error}
-        stage.path = stage.path.with_name(f"{number}.mcap")
-        times = iter((1.0, 2.0))
-        watch = SimpleNamespace(monotonic=lambda times=times: next(times), time_ns=lambda: 5)
-        monkeypatch.setattr(over_bus, "time", watch)
-        monkeypatch.setattr(over_bus, "GaitPublisher", recorder)
+def test_samples_that_a_recorder_did_not_take_are_told(stage):
+    Recorder.dropped = 3
+    try:
         report = stage.drive(Snake(), SNAKE, Ways(25), recorder=stage.path, duration_s=0.01)
-        assert (report.not_taken, report.taken) == (expected, 17)
+    finally:
+        Recorder.dropped = 0
+    expected = "3 samples: the recorder was too slow"
+    assert (report.not_taken, report.taken) == (expected, 17)
 
 
-@pytest.mark.parametrize(
-    ("fails", "text"), [(ValueError("no way"), "no way"), (ValueError(), "ValueError")]
-)
-def test_a_gait_that_fails_is_the_verdict_and_is_raised(stage, fails, text):
+def test_a_gait_that_fails_is_the_verdict_and_is_raised(stage):
     link = Snake()
-    with pytest.raises(ValueError, match=f"^{fails}$"):
-        stage.drive(link, SNAKE, Ways(25, fails=fails), recorder=stage.path)
+    with pytest.raises(ZeroDivisionError):
+        stage.drive(link, SNAKE, Ways(25, fails=ZeroDivisionError()), recorder=stage.path)
     assert (link.closed, stage.recorders[0].closed) == (1, 1)
-    assert stage.recorders[0].notes[-1] == ("error", text)
+    assert stage.recorders[0].notes[-1] == ("error", "ZeroDivisionError")  # it has no text
     assert not link.angles.any()  # it came to rest before
     with Session.open(stage.path) as session:
         assert session.verdict == "bad"
-        assert said(session)[-1] == (40, text)
-        assert json.loads(session.metadata["undulog.health"]["reasons"]) == [text]
+        assert said(session)[-1] == (40, "ZeroDivisionError")
+        reasons = session.metadata["undulog.health"]["reasons"]
+        assert json.loads(reasons) == ["ZeroDivisionError"]
 
 
 def test_a_stop_and_a_disk_that_fills_end_it_by_a_ramp(stage, monkeypatch):
@@ -348,10 +337,9 @@ def timed(stage, monkeypatch):
     return stage
 
 
-@pytest.mark.parametrize(("kind", "refused"), [(Arm, False), (Paced, True)])
-def test_by_the_clock_it_listens_first_and_spaces_what_follows_a_late_tick(timed, kind, refused):
-    timed.refused, time = refused, timed.time
-    link, begun_ns = kind(time), time.now_ns
+def test_by_the_clock_it_listens_first_and_spaces_what_follows_a_late_tick(timed):
+    timed.refused, time = True, timed.time
+    link, begun_ns = Paced(time), time.now_ns
 
     def late(tick):
         if tick.tick == 60:
@@ -372,7 +360,7 @@ def test_by_the_clock_it_listens_first_and_spaces_what_follows_a_late_tick(timed
     assert timed.priorities == ["raised", "lowered"]
     with Session.open(timed.path) as session:
         lowered = [text for _, text in said(session) if text.startswith("priority was refused: ")]
-        assert len(lowered) == refused
+        assert len(lowered) == 1
         assert session.metadata["undulog.gate.feedback"] == report.feedback.facts()
         assert session.metadata["undulog.gate.jitter"]["ticks"] == "71"
         given = session.joints("/joint_commands").signal("joint01")
@@ -392,6 +380,7 @@ def test_what_no_reply_has_confirmed_holds_the_next_command_back(timed):
     with Session.open(timed.path) as session:
         given = session.joints("/joint_commands").signal("joint01")
         np.testing.assert_allclose(given.values, expected, atol=1e-7)
+        assert not any("priority" in text for _, text in said(session))
     assert (report.cuts["by_position"], report.cuts["by_rate"]) == (0, 4)
     assert report.cuts["unconfirmed"] in {2, 3}  # a step in 10 ms may round to be late by 1 ns
     assert (report.held_s, report.feedback.by_replies) == (0.0, True)
