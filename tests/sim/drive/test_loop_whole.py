@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from support.frozen_records import mutable_dataclasses
 from support.simulated_clock import SimulatedClock
 from undulog.capture import load_robot
 from undulog.capture.bus.encoding import BusEncoder
@@ -174,12 +173,3 @@ def test_nothing_is_sent_to_a_silent_bus_and_the_drive_ends(silent_s):
     assert (sent_s.max() > 2.0 + silent_s) == heard_again
     last = {joint: angle for _, joint, angle in drive.bus.commands}
     assert np.allclose(list(last.values()), 0.0, atol=STEP) == heard_again  # by its ramp
-
-
-def test_what_is_handed_on_can_not_be_changed():
-    assert mutable_dataclasses("undulog.sim.drive") == {
-        "BusReport",
-        "LoopTally",
-        "_Sent",
-        "_Telling",
-    }

@@ -49,13 +49,13 @@ def test_a_tick_at_an_edge_counts_below_it(above_ms):
 
 
 def test_lateness_in_a_line_and_for_json():
-    found = Jitter(200, 0.00015, 0.0123, 0.5, (200, *[0] * 10))
+    found = Jitter(200, 0.15678, 1.25678, 2.34567, (200, *[0] * 10))
     assert str(found) == (
-        "ticks were late by 0.15 ms (median), 12.30 ms (99 %), 500.00 ms at worst"
+        "ticks were late by 156.78 ms (median), 1256.78 ms (99 %), 2345.67 ms at worst"
     )
     values = found.to_dict()
     del values["counts"]
-    assert values == {"ticks": 200, "median_s": 0.00015, "p99_s": 0.0123, "worst_s": 0.5}
+    assert values == {"ticks": 200, "median_s": 0.15678, "p99_s": 1.25678, "worst_s": 2.34567}
 
 
 def test_faults_and_outcomes_for_json():
