@@ -11,6 +11,7 @@ import pytest
 
 from support import twin_chains
 from undulog.capture import Session
+from undulog.capture.common.errors import OutputExistsError, SimulationError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
@@ -80,6 +81,8 @@ def test_it_has_the_time_for_the_pose_and_the_longest_ramps_and_ends_with_the_ga
     assert [text for _, text in run.remarks] == [
         f"gate: {phase}" for phase in ("reading the pose", "run", "done")
     ]
+    with pytest.raises(OutputExistsError):
+        dry_run(driven, output=path)
     with Session.open(path) as session:
         assert session.verdict == "good"
         facts = session.metadata["undulog"]
@@ -127,6 +130,19 @@ def test_a_fault_is_the_verdict_of_its_session(tmp_path):
     with Session.open(path) as session:
         assert session.verdict == "bad"
         assert run.fault.text in session.metadata["undulog.health"]["reasons"]
+
+
+def test_a_twin_that_fails_is_raised_and_told_where_there_is_a_session(tmp_path):
+    coarse = dataclasses.replace(nominal_world(ROBOT), physics_rate_hz=200)
+    driven, _ = motion((0.2, -0.1, 0.2), world=coarse, duration_s=1.0)
+    path = tmp_path / "a.mcap"
+    for output in (None, path):
+        with pytest.raises(SimulationError, match="the twin failed at 0") as failed:
+            dry_run(driven, output=output)
+    with Session.open(path) as session:
+        assert session.verdict == "bad"
+        texts = [(message.level, message.msg) for _, message in session.messages("/rosout")]
+        assert (40, str(failed.value)) in texts
 
 
 def test_the_robot_is_that_of_the_world_the_motion_or_the_one_given():

@@ -175,6 +175,13 @@ def test_a_plane_comes_in_only_where_it_was_driven_from_the_start():
             (0.2, 0.7), (0.1, 0.5),
         ]  # fmt: skip
     assert found.ramp_s == 0.5
+    one = parts(1.0, more="vertical = { amplitude = 0.1 }\n")
+    (segment,) = parse_plan(head + both + one, Path("p.toml")).segments
+    assert [one.amplitude for one in segment.planes.values()] == [0.2, 0.1]
+    wrong = rest.replace("amplitude = 0.1", "amplitude = -0.1")
+    assert list(faults(head + level.format("vertical") + wrong))[:2] == [
+        "segments[0].horizontal", "segments[0].vertical.amplitude",
+    ]  # fmt: skip
     missing = faults(head + level.format("horizontal") + rest)
     assert list(missing) == ["segments[0].vertical", "segments[1].vertical"]
     assert "driven from the start (horizontal)" in missing["segments[0].vertical"]

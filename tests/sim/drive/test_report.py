@@ -74,7 +74,7 @@ def test_one_that_was_stopped_says_where_and_why(report, plan):
 def test_what_was_not_as_it_should_be_is_remarked(report):
     report.jitter = jitter([0.001, 0.002, 0.003])
     report.tally.overruns, report.malformed, report.dropped = 2, 3, 4
-    report.waits, report.longest_wait_s = 5, 0.00125
+    report.waits, report.longest_wait_s = 5, 0.98765
     report.cuts = {"position": 0, "over_rate": 6, "yields": 7}
     assert report.remarks() == [
         GateEvent("info", "ticks were late by 2.00 ms (median), 2.98 ms (99 %), 3.00 ms at worst"),
@@ -83,7 +83,7 @@ def test_what_was_not_as_it_should_be_is_remarked(report):
         GateEvent("warn", "messages of the bus that were dropped: 4"),
         GateEvent(
             "info",
-            "commands that followed a late one and waited: 5, up to 1.25 ms, so that no command "
+            "commands that followed a late one and waited: 5, up to 987.65 ms, so that no command "
             "was too fast",
         ),
         GateEvent("warn", "the gate changed commands of single joints: 6 over rate, 7 yields"),
@@ -116,6 +116,26 @@ def test_facts_are_plain_values_with_units_in_their_names(report, plan):
     assert found["feedback"]["most_steps"] == 7
     assert found["lateness"]["ticks"] == 1
     assert found["real_time_factor"] == pytest.approx(6500.0)  # of no time at all
+
+
+def test_what_nobody_counted_is_nothing(report, plan):
+    report.wall_s = 0.5
+    assert report.facts() == {
+        "driven": "wave.mcap", "kind": "commands", "on": plan.address.text, "robot": "chain3",
+        "path": "out.mcap", "planned_duration_s": 5.0, "recorder": None, "armed": True,
+        "pace": "real time", "outcome": "complete", "why": None, "ended": "the joints are straight",
+        "fault": None, "complete": True, "duration_s": 5.0, "approach_s": 1.25, "whole_s": 6.5,
+        "ticks": 500, "overruns": 0, "sent": 1500, "received": 4000, "decoded": 3900, "waits": 0,
+        "longest_wait_s": 0.0, "malformed": 0, "dropped": 0, "held_s": 0.0, "feedback": None,
+        "changed": {}, "lateness": None, "real_time_factor": 13.0, "first_frames": [],
+        "gait_told": 0, "gait_not_told": None,
+    }  # fmt: skip
+    bare = BusReport(plan, COMPLETE, LoopTally(), False, None, 0.0, 0, {}, None)
+    assert (bare.wall_s, bare.facts()["real_time_factor"]) == (0.0, 0.0)
+    tally = LoopTally()
+    assert (tally.loop_s, tally.commanded, tally.untold, tally.late_s) == (0.0, False, 0, [])
+    counts = (tally.overruns, tally.sent, tally.received, tally.decoded)
+    assert counts == (0, 0, 0, 0)
 
 
 def test_how_many_steps_may_be_on_their_way():
