@@ -196,6 +196,9 @@ def test_a_row_of_the_table():
         first,
         "joint02 -11.5 17.2 50 57 25 1146 2.9 20 0.600 40 0.250 - - 0.000 0.750 2.000 12%",
     ]
+    _, *lines = joint_table((demand("a"), negative), WIDE)  # words begin, numbers end alike
+    assert [line[:9] for line in lines] == ["joint    ", "a        ", "joint02  "]
+    assert len({len(line) for line in lines}) == 1
     narrow = list(joint_table((demand(),), 60))
     assert narrow[0] == f"{heading}; the terminal is too narrow for all of it, --json has it"
 
