@@ -181,6 +181,18 @@ def test_the_way_to_the_first_pose_in_a_line(more, line):
     assert line in list(summary_lines(dry(**more), WIDE))
 
 
+@pytest.mark.parametrize(
+    ("seconds", "power"), [(0.5, "0.75 W and 8 W"), (0.0, "3.75e+08 W and 4e+09 W")]
+)
+def test_the_mean_power_is_that_of_any_length(seconds, power):
+    run = dry(duration_s=seconds)
+    (line,) = (line for line in summary_lines(run, WIDE) if line.startswith("energy"))
+    assert line.endswith(f"; mean power {power}")
+    found = reported(run)
+    powers = [found[key] * max(seconds, 1e-9) for key in ("power_net_w", "power_el_w")]
+    assert powers == pytest.approx([0.375, 4.0])
+
+
 def test_a_row_of_the_table():
     negative = demand("joint02", energy_net_j=-0.0001, clamped=0.125, current_peak=NAN)
     heading, titles, *rows = joint_table((demand(), negative), WIDE)
