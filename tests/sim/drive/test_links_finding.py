@@ -1,6 +1,8 @@
 """Looking for a virtual robot: what a server is asked, and what its answers mean."""
 
+import dataclasses
 import errno
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from undulog.capture import load_robot
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.common.errors import SourceError
+from undulog.capture.common.errors import DataError, SourceError
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.robot.model import Direction, Quantity
 from undulog.capture.sources.contract import parse_address
@@ -208,3 +210,23 @@ def test_the_age_of_each_value_is_its_own():
         np.testing.assert_allclose(status.silence_s[:2], [now_s - 1.0, now_s - 1.25])
     known.add(encode({("joint02", Quantity.POSITION, ""): 0.2}), 1.8)
     assert known.angles[:3].tolist() == [1, 2, 0]
+
+
+def test_beyond_its_greatest_range_a_sensor_sees_nothing():
+    robot = load_robot("snake25")
+    (sensor,) = (one for one in robot.sensors if one.name == "ir01")
+    farther = dataclasses.replace(sensor, range_max=0.5)
+    endless = dataclasses.replace(sensor, range_max=None)
+    encode = BusEncoder(robot, Direction.RX).encode
+    for one, seen in ((farther, (0.3, 0.5, math.inf)), (endless, (0.3, 0.5, 0.7))):
+        others = tuple(one if other is sensor else other for other in robot.sensors)
+        known, found = BusReadings(dataclasses.replace(robot, sensors=others)), []
+        for distance in (0.3, 0.5, 0.7):
+            known.add(encode({("ir01", Quantity.RANGE, ""): distance}), 1.0)
+            found.append(known.readings(1.0).ranges["ir01"])
+        assert found == pytest.approx(seen)
+
+
+def test_a_robot_without_a_bus_map_tells_nothing():
+    with pytest.raises(DataError):
+        BusReadings(dataclasses.replace(load_robot("snake25"), bus=None))
