@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import some_names
-from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
+from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, RestsOff, clause_of
 from undulog.capture.judgement.naming import NAMED
 
 from ..results import formats
@@ -157,6 +157,23 @@ def fault_in_words(fault: NotFollowing) -> str:
     return f"{plain(fault.joint)} does not follow its command{when}: {kinds_in_words(fault.kinds)}"
 
 
+def rests_in_words(rests: Sequence[RestsOff]) -> str:
+    """Joints that rest off their commands, as one clause.
+
+    Returns:
+        For example ``Pitch, Elbow rest 4.3 and 4.6 degrees off their commands``.
+    """
+    if len(rests) == 1:
+        return clause_of(rests[0], plain(rests[0].joint))
+    sizes = [f"{abs(math.degrees(each.offset_rad)):.2g}" for each in rests]
+    if len(rests) > NAMED:
+        most = max(sizes, key=float)
+        return f"{len(rests)} joints rest off their commands, up to {most} degrees"
+    names = ", ".join(plain(each.joint) for each in rests)
+    verb = "rest" if any(each.rests for each in rests) else "are"
+    return f"{names} {verb} {', '.join(sizes[:-1])} and {sizes[-1]} degrees off their commands"
+
+
 def _named(facts: Facts) -> str:
     """Return the joints that do not follow, then those that stand out; empty for none."""
     clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
@@ -166,12 +183,10 @@ def _named(facts: Facts) -> str:
     if facts.judgement.naming:
         clauses.insert(0, plain(facts.judgement.naming))
     judged = facts.judgement
-    rests = judged.rests if len(judged.rests) <= NAMED else ()
-    differences = (*judged.changes, *judged.extra, *_apart(facts), *rests)
+    differences = (*judged.changes, *judged.extra, *_apart(facts))
     clauses += [clause_of(each, plain(each.joint)) for each in differences[:NAMED]]
-    if judged.rests and not rests:
-        most = math.degrees(max(abs(each.offset_rad) for each in judged.rests))
-        clauses.append(f"{len(judged.rests)} joints rest off their commands, up to {most:.2g}°")
+    if judged.rests:
+        clauses.append(rests_in_words(judged.rests))
     changed = {change.joint for change in judged.changes}
     off = {rest.joint for rest in judged.rests}
     by_joint: dict[str, list[StandOut]] = {}
@@ -189,7 +204,7 @@ def _named(facts: Facts) -> str:
     if len(by_joint) > NAMED:
         names = [plain(joint) for joint in list(by_joint)[NAMED:]]
         clauses.append(f"{', '.join(names)} respond differently, too")
-    if undecided := _undecided(facts):
+    if not clauses and (undecided := _undecided(facts)):
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
     return f"{'; '.join(clauses)}." if clauses else ""

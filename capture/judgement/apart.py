@@ -11,13 +11,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..common.arrays import FloatArray
 from .exposure import LIKE_LAG_S, Exposure, responds
 from .fault import Apart
-from .levels import ENOUGH_LIKE, QUARTER
+from .levels import ENOUGH_LIKE, QUARTER, TINY
+from .motion import Course
 
 
-def find_apart(exposure: Exposure, names: Sequence[str], left_out: Sequence[bool]) -> list[Apart]:
+def find_apart(
+    course: Course, exposure: Exposure, names: Sequence[str], left_out: Sequence[bool]
+) -> list[Apart]:
     """Find the joints whose gain or lag lies apart from those of the others.
+
+    A gain does so by the response and by the slope of the position over the command: stick and play
+    at rests are no gain, but a response of few rests takes them for one.
 
     Apart is further from the nearest of them than twice their spread, and further than joints
     differ that count as like (:func:`.exposure.agrees`). Of five and more joints the spread is that
@@ -35,22 +42,32 @@ def find_apart(exposure: Exposure, names: Sequence[str], left_out: Sequence[bool
     ]
     if len(kept) < ENOUGH_LIKE:
         return []
-    found: list[Apart] = []
-    for quantity in ("lag", "gain"):
-        values = {
-            k: response.lag_s if quantity == "lag" else response.gain
-            for k, response in enumerate(exposure.responses)
-            if k in kept
-        }
-        for k, value in values.items():
-            others = np.array([values[j] for j in kept if j != k])
-            middle = float(np.median(others))
-            if others.size >= ENOUGH_LIKE:  # one of them may be apart, too
-                others = np.delete(others, np.argmax(np.abs(others - middle)))
-            low, high = float(others.min()), float(others.max())
-            away = max(value - high, low - value)
-            margin = QUARTER * middle
-            margin = max(margin, LIKE_LAG_S) if quantity == "lag" else margin
-            if away > max(2 * (high - low), margin):
-                found.append(Apart(names[k], quantity, value, (low, high)))
+    lags = _apart(np.array([exposure.responses[k].lag_s for k in kept]), LIKE_LAG_S)
+    gains = _apart(np.array([exposure.responses[k].gain for k in kept]), 0.0)
+    slopes = _apart(np.array([_slope(course, exposure, k) for k in kept]), 0.0)
+    found = [Apart(names[kept[i]], "lag", *each) for i, each in lags.items()]
+    found += [Apart(names[kept[i]], "gain", *gains[i]) for i in gains if i in slopes]
     return found
+
+
+def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[float, float]]]:
+    """Return the values that lie apart by index, each with the least and largest of the others."""
+    found: dict[int, tuple[float, tuple[float, float]]] = {}
+    for i, value in enumerate(values.tolist()):
+        others = np.delete(values, i)
+        middle = float(np.median(others))
+        if others.size >= ENOUGH_LIKE:  # one of them may be apart, too
+            others = np.delete(others, np.argmax(np.abs(others - middle)))
+        low, high = float(others.min()), float(others.max())
+        away = max(value - high, low - value)
+        if away > max(2 * (high - low), QUARTER * middle, least):
+            found[i] = value, (low, high)
+    return found
+
+
+def _slope(course: Course, exposure: Exposure, k: int) -> float:
+    """Return the slope of a joint's position over its command as late as its response."""
+    late = np.interp(course.t_s - exposure.responses[k].lag_s, course.t_s, course.command[k])
+    known = course.present[k]
+    asked, seen = late[known] - late[known].mean(), course.position[k][known]
+    return float(asked @ seen) / max(float(asked @ asked), TINY)

@@ -109,7 +109,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
             for rest in find_rests(course, exposure, stillness)
             if healthy[rest.joint]
         ),
-        apart=tuple(find_apart(exposure, names, left_out)),
+        apart=tuple(find_apart(course, exposure, names, left_out)),
         unexposed=tuple(
             (name, float(np.ptp(course.command[k])))
             for k, name in enumerate(names)
