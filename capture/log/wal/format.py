@@ -51,7 +51,7 @@ class WalLock:
         """
         self._path = folder / LOCK_NAME
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
             self._file = os.open(self._path, flags, 0o666)
         except OSError as error:
             raise LogWriteError(folder, f"can't be written: {error.strerror}") from error
@@ -80,7 +80,7 @@ class WalLock:
 def is_live(folder: Path) -> bool:
     """Whether a recorder is writing a log now; always False on a file system without locks."""
     try:
-        opened = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CLOEXEC)
+        opened = os.open(folder / LOCK_NAME, os.O_RDONLY)
     except OSError:
         return False
     try:
@@ -184,7 +184,8 @@ class SegmentHeader:
         if len(data) != HEADER_SIZE:
             return None
         body, rest = data[: _HEADER_BODY.size], data[_HEADER_BODY.size :]
-        if zlib.crc32(body) != RECORD_CRC.unpack_from(rest)[0]:
+        (crc,) = RECORD_CRC.unpack_from(rest)
+        if zlib.crc32(body) != crc:
             return None
         magic, stream, salt, number, size, log_id = _HEADER_BODY.unpack(body)
         return cls(stream, salt, number, size, log_id) if magic == MAGIC else None

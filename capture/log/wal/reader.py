@@ -210,7 +210,7 @@ class Recovery(Iterator[WalMessage]):
                 try:
                     reader = _SegmentReader(segment, segment.path.open("rb"), last)
                     for head, payload in reader.records():
-                        if former is not None and head.position > last + 1:
+                        if former is not None:
                             # A log in use: the former segment has grown while it was read.
                             yield from former.later()
                         last = head.position
@@ -256,17 +256,17 @@ class _SegmentReader:
             head = self._whole(at)
             if head is None:
                 following, stop = self._search(at)
-                # A log in use: this record was being written; a later one exists, so now it is
-                # whole.
-                head = self._reread(at) if following is not None else None
-                if head is not None:
-                    following, stop = (at, head), at
-                if stop > at:
+                if following is not None:
+                    # A log in use: this record was being written; a later one exists, so now it is
+                    # whole.
+                    self._forget()
+                    head = self._whole(at)
+                if head is None:
                     self.first_damage = self.first_damage or at
                     self.damaged += stop - at
-                if following is None:
-                    return
-                at, head = following
+                    if following is None:
+                        return
+                    at, head = following
             self.last = head.position
             self._file.seek(at + RECORD_SIZE)
             payload = self._file.read(head.length)
@@ -274,18 +274,16 @@ class _SegmentReader:
             yield head, payload
 
     def later(self) -> Iterator[tuple[RecordHead, bytes]]:
-        """Yield records written since the end was reached, without counting damage again."""
-        damage = self.damaged, self.first_damage
-        self._file.seek(0, os.SEEK_END)  # drops the read buffer
+        """Yield records written since the end was reached."""
+        self._forget()
         yield from self.records()
-        self.damaged, self.first_damage = damage
 
     def close(self) -> None:
         self._file.close()
 
-    def _reread(self, at: int) -> RecordHead | None:
-        self._file.seek(0, os.SEEK_END)  # drops the read buffer
-        return self._whole(at)
+    def _forget(self) -> None:
+        """Drop the read buffer, as every seek to the end does."""
+        self._file.seek(0, os.SEEK_END)
 
     def _whole(self, at: int) -> RecordHead | None:
         """Return the head of the record at an offset, if its CRC fits.
@@ -304,7 +302,7 @@ class _SegmentReader:
         crc = zlib.crc32(raw[RECORD_CRC.size :], self._salt)
         for start in range(0, head.length, _PIECE):
             crc = zlib.crc32(self._file.read(min(_PIECE, head.length - start)), crc)
-        return head if crc == RECORD_CRC.unpack_from(raw)[0] else None
+        return head if (crc,) == RECORD_CRC.unpack_from(raw) else None
 
     def _search(self, at: int) -> tuple[tuple[int, RecordHead] | None, int]:
         """Find the next whole record behind an offset, and the end of the damage."""
@@ -314,11 +312,9 @@ class _SegmentReader:
             self._file.seek(start)
             # Reads overlap by the length of a head, so that none is split.
             data = self._file.read(min(size + RECORD_SIZE, self._end - start))
-            if not data:
-                break
             if not _ZEROS.startswith(data):  # the usual case, at the speed of memcmp
                 for offset in self._candidates(data):
-                    head = self._whole(start + offset) if start + offset > at else None
+                    head = self._whole(start + offset)
                     if head is not None:
                         return (start + offset, head), start + offset
                 damage_stop = start + len(data.rstrip(b"\0"))
@@ -327,14 +323,11 @@ class _SegmentReader:
         return None, damage_stop
 
     def _candidates(self, data: bytes) -> list[int]:
-        """Return offsets, multiples of 8, with kind, mark and running number of a record."""
+        """Return offsets, multiples of 8, with kind and mark of a record."""
         words = np.frombuffer(data[: len(data) & -8], dtype="<u8")
-        if words.size < RECORD_SIZE // 8:
-            return []
-        marked = np.zeros(words.size - 2, dtype=bool)
+        marked = np.zeros(words[2:].size, dtype=bool)
         for kind in self._kinds:
             marked |= words[2:] & np.uint64(0xFFFF) == kind | MARK << 8
-        marked &= words[1:-1] > np.uint64(self.last)
         return [int(index) * 8 for index in np.flatnonzero(marked)]
 
 
@@ -446,7 +439,7 @@ class WalTail:
         """
         data = bytearray()
         places: dict[int, list[int]] = {}
-        start_ns, end_ns = 1 << 63, 0
+        times_ns: list[int] = []
         for item in messages:
             places.setdefault(item.channel_id, []).append(len(data))
             data += MESSAGE.pack(
@@ -458,13 +451,12 @@ class WalTail:
                 item.publish_time_ns,
             )
             data += item.payload
-            start_ns = min(start_ns, item.log_time_ns)
-            end_ns = max(end_ns, item.log_time_ns)
+            times_ns.append(item.log_time_ns)
         self._data = bytes(data)
         self.counts = {channel_id: len(at) for channel_id, at in places.items()}
         offsets = {channel_id: np.array(at, dtype=np.int64) for channel_id, at in places.items()}
         size = len(self._data)
-        self.blocks = [Block(0, size, "", size, 0, start_ns, end_ns, offsets=offsets)]
+        self.blocks = [Block(0, size, "", size, 0, min(times_ns), max(times_ns), offsets=offsets)]
 
     def payload(self, block: Block) -> tuple[bytes, int, int]:
         """See :meth:`.McapPayloads.payload`."""

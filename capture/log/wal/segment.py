@@ -106,7 +106,7 @@ class _Watch:
 
     def _set_handler(self) -> None:
         """Set the handler; if the system allows no callbacks from C, SIGBUS ends the process."""
-        if sys.platform != "linux" or sys.maxsize < 2**32:
+        if sys.maxsize < 2**32:
             return
         try:
             handler = _HANDLER(self._on_signal)
@@ -158,7 +158,7 @@ def free_bytes(path: Path) -> int:
         OSError: If the file system can't be queried.
     """
     existing = path.absolute()
-    while not existing.exists() and existing != existing.parent:
+    while not existing.exists():
         existing = existing.parent
     found = os.statvfs(existing)
     return found.f_bavail * found.f_frsize
@@ -208,7 +208,7 @@ class Segment:
         self._page_end = _PAGE
         self._whole = 0, 0  # start of the page that is being written, last record wholly before it
         try:
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         except OSError as error:
             raise LogWriteError(path, f"can't be created: {error.strerror}") from error
         try:
@@ -294,7 +294,7 @@ class Segment:
         self._at = start
         if start > self._page_end:
             page = start & -_PAGE
-            whole = max(0, page - first) // size
+            whole = (page - first) // size
             self._whole, self._page_end = (page, position - 1 + whole), page + _PAGE
         self.last = position + len(messages) - 1
         return True
