@@ -78,7 +78,7 @@ def integrate(
     last: Weighed | None = None
     for power in powers:
         part = power.between(start_s, stop_s)
-        if part.count < 2 or stop_s <= start_s:
+        if part.count < 2:
             found.append(None)
             continue
         if last is None or not np.array_equal(last.t_s, part.t_s):
