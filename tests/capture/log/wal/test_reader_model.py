@@ -218,6 +218,20 @@ def test_damage_is_told_from_where_it_is_also_of_a_segment_that_grows(tmp_path):
     assert recovery.warnings[0] == damage
 
 
+def test_a_record_that_was_read_half_written_is_read_again(tmp_path):
+    """The reader's buffer has the next one, which came while the buffer was filled."""
+    raw, places = segment_of([(k, 5, bytes([k]) * 500) for k in range(1, 5)], size=4096)
+    torn = bytearray(raw)
+    torn[places[1] : places[1] + 4] = bytes(4)  # a CRC is written last
+    folder = written(tmp_path / "w", [torn])
+    recovery = recover(folder)
+    first = next(recovery)
+    with (folder / "000001.seg").open("r+b") as file:
+        file.write(raw)
+    assert [first.position, *(one.position for one in recovery)] == [1, 2, 3, 4]
+    assert recovery.warnings == ["messages of channels that are not defined: 9"]
+
+
 def test_a_log_that_goes_while_it_is_listed_is_none(tmp_path, monkeypatch):
     folder = filled(wal_folder(tmp_path / "x.mcap"), 3)
 

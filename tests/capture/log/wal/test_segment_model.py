@@ -162,3 +162,15 @@ def test_files_of_a_log_are_not_left_to_other_programs(made, tmp_path):
     for path in (segment.path, tmp_path / "recorder.lock"):
         assert not os.get_inheritable(open_files[str(path)])
     lock.release()
+
+
+def test_a_system_without_a_watch_of_memory_writes_segments_all_the_same(made, monkeypatch):
+    def refuses(_):
+        raise MemoryError
+
+    monkeypatch.setattr(segments, "_WATCH", segments._Watch())
+    monkeypatch.setattr(segments, "_HANDLER", refuses)
+    segment = made(1)
+    assert segment.put((1, 5, MARK, 1, 0, 0, 0), b"payload")
+    assert b"payload" in segment.path.read_bytes()
+    assert not segment.cut
