@@ -91,6 +91,7 @@ def test_a_spare_segment_that_is_too_small_is_removed(tmp_path):
 
 def test_a_log_whose_folder_is_gone_ends_where_nothing_is_to_be_kept(tmp_path):
     wal = WriteAheadLog(tmp_path / "w")
+    wait_for(lambda: wal._spare is not None, "the last file to be made")
     shutil.rmtree(tmp_path / "w")
     wal.close()
     assert not (tmp_path / "w").exists()
