@@ -31,6 +31,7 @@ def test_messages_are_one_block_of_mcap_records():
     data, start, stop = tail.payload(block)
     assert (start, stop) == (0, len(data))
     assert tail.payload_once(block)[0] is data
+    assert (block.size, block.compression, block.crc) == (len(data), "", 0)
     at, places = 0, {1: [], 2: []}
     for item in MESSAGES:  # opcode 5, length, channel, sequence, log and publish time, payload
         head = struct.unpack_from("<BQHIQQ", data, at)
