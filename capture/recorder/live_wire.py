@@ -161,7 +161,7 @@ def _description(kind: int, payload: bytes) -> Definition:
         if not unpacker.eof:
             raise DataError("a definition of the live feed is too long or cut short")
         return unpack_definition(kind, body)
-    except (zlib.error, McapError, KeyError, ValueError, OverflowError) as error:
+    except (zlib.error, struct.error, McapError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"a definition of the live feed can't be read: {error}") from error
 
 
