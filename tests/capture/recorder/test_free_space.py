@@ -37,13 +37,13 @@ def test_what_is_no_folder_and_a_disk_that_fails_are_errors(tmp_path, monkeypatc
         with pytest.raises(LogWriteError) as caught:
             FreeSpace(path)
         assert str(caught.value) == f"{path}: its folder can't be used: {os.strerror(code)}"
-    free = FreeSpace(tmp_path / "run.mcap")
+    free, errors = FreeSpace(tmp_path / "run.mcap"), [OSError("x"), OSError(errno.EIO, "x")]
 
     def fails(_):
-        raise error
+        raise errors.pop()
 
     monkeypatch.setattr(free_space.os, "fstatvfs", fails)
-    for error, code in ((OSError(errno.EIO, "x"), errno.EIO), (OSError("x"), 0)):
+    for code in (errno.EIO, 0):
         with pytest.raises(LogWriteError, match=f"can't be used: {os.strerror(code)}$"):
             free()
     free.close()
