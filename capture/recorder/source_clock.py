@@ -136,7 +136,7 @@ class Envelope:
     def _drop_before(self, kept: int) -> None:
         """Drop all but the last points; the rate becomes the expected one."""
         line = self.line
-        sigma = max(3.0 * line.uncertainty, 1e-6) if self.settled else self._prior[1]
+        sigma = max(3.0 * line.uncertainty, 1e-6)
         self._prior = (line.rate, min(sigma, PRIOR))
         while len(self._points) > kept:
             self._points.popleft()
