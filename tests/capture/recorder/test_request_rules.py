@@ -80,7 +80,17 @@ def test_the_planes_have_five_values_each_and_further_names_two_words_at_least(s
         "A", "omega", "lag", "offset", "phase",
     ] * 2  # fmt: skip
     assert [name.partition(".")[0] for name in GAIT_NAMES] == ["horizontal"] * 5 + ["vertical"] * 5
-    for name in ("joint03", "joint03.", ".A", "3.A", "a b.c", "a.é", "é.a", "horizontal.B", "a.b\n"):
+    for name in (
+        "joint03",
+        "joint03.",
+        ".A",
+        "3.A",
+        "a b.c",
+        "a.é",
+        "é.a",
+        "horizontal.B",
+        "a.b\n",
+    ):
         assert stage.refused("gait", values={name: 1.0}).startswith("values: found ")
     names = ("a.b", "a-b_3.c-d.e_4", "Z.0", *reversed(GAIT_NAMES))
     stage.ask("gait", values={name: float(k) for k, name in enumerate(names)})
@@ -152,7 +162,9 @@ def test_a_mark_may_be_empty_and_a_level_is_info_by_default(stage):
         assert stage.refused("note", text="x", level=level).startswith("level: found ")
 
 
-@pytest.mark.parametrize(("keys", "reply"), [({}, {}), ({"wait": False}, {}), ({"wait": True}, None)])
+@pytest.mark.parametrize(
+    ("keys", "reply"), [({}, {}), ({"wait": False}, {}), ({"wait": True}, None)]
+)
 def test_who_waits_for_the_end_gets_no_reply_before_it(stage, keys, reply):
     assert stage.ask("stop", **keys) == reply
     assert stage.actions.stops == 1
