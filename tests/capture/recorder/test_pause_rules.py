@@ -63,8 +63,10 @@ def test_half_a_second_without_a_signal_is_a_pause(missing_ns):
         began_ns, ended_ns = BEGIN_NS + 200 * MS, BEGIN_NS + 720 * MS
         assert loop.watch.pauses == [Pause(began_ns, ended_ns, 0, by_signal=False)]
         assert texts == (
-            "the recorder did not run for 0.52 s: a debugger, a frozen container, or other "
-            f"programs held the processors; {NO_LOSS}",
+            (
+                "the recorder did not run for 0.52 s: a debugger, a frozen container, or other "
+                f"programs held the processors; {NO_LOSS}"
+            ),
         )
 
 
