@@ -156,7 +156,7 @@ def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     what = f"{snapshot.state} {_shorter(snapshot.path, width - 21 - len(snapshot.state))}"
     robot = f"  {snapshot.robot}" if snapshot.robot else ""
     time = clock_time(snapshot.elapsed_s)
-    first = Text(no_wrap=True)
+    first = Text()
     first.append(fit(what + robot, width - len(time) - 1), "bold")
     first.append(" " + time, "bold")
     facts = [format_size(snapshot.size)]
@@ -177,7 +177,7 @@ def _room(snapshot: RecorderSnapshot) -> str:
 
 
 def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
-    line = Text(no_wrap=True)
+    line = Text()
     line.append(f" {snapshot.verdict.upper()} ", STYLES[snapshot.verdict])
     count = len(snapshot.reasons)
     why = "nothing found so far" if not count else f"so far, {count} reason{'s' * (count != 1)}"
@@ -201,7 +201,7 @@ def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
 def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
     ago_s = max(snapshot.now_ns - event.t_ns, 0) / NS
     at = clock_time(max(snapshot.elapsed_s - ago_s, 0.0))
-    line = Text(f"{at} ", no_wrap=True)
+    line = Text(f"{at} ")
     line.append(event.level, _LEVELS.get(event.level, ""))
     line.append(cut(f" {event.name}: {event.text}", width - len(at) - 1 - len(event.level)))
     return line
@@ -214,8 +214,8 @@ def _rows(topics: Sequence[TopicSnapshot]) -> list[TopicSnapshot]:
         if not has_rhythm(topic.topic):
             continue
         group = group_of(topic.topic)
-        alone = group == "joints" or topic.topic.count("/") < 2
-        groups.setdefault(topic.topic if alone else f"/{group}", []).append(topic)
+        name = topic.topic if group == "joints" else f"/{group}"
+        groups.setdefault(name, []).append(topic)
     rows: list[TopicSnapshot] = []
     for name, members in groups.items():
         if len(members) <= _SHOWN_ALONE:
