@@ -7,7 +7,9 @@ import pty
 import re
 import select
 import struct
+import sys
 import termios
+import threading
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 
@@ -223,8 +225,15 @@ def read_until(number, wanted):
     return found.decode()
 
 
-def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(monkeypatch):
-    monkeypatch.setenv("TERM", "xterm-256color")
+@pytest.fixture
+def usual_size(monkeypatch):
+    """What a terminal that the tests run in doesn't change."""
+    for name, value in (("TERM", "xterm-256color"), ("COLUMNS", "100"), ("LINES", "30")):
+        monkeypatch.setenv(name, value)
+
+
+@pytest.mark.usefixtures("usual_size")
+def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end():
     with terminal() as (ours, stream):
         shown = Terminal(stream)
         shown.show(SNAPSHOT)
@@ -234,7 +243,25 @@ def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(monkeypatch):
         assert shown.close()
         stream.write("the report\n")
         stream.flush()
-        assert "\x1b[2K" in read_until(ours, "the report")  # lines of the screen are erased
+        left = read_until(ours, "the report").rpartition("the connection is lost")[2]
+        assert left.count("\x1b[2K") == len(rows(SNAPSHOT, 100))  # each line is erased
+
+
+@pytest.mark.usefixtures("usual_size")
+def test_a_terminal_is_drawn_on_by_one_thread_in_all_its_lines_but_the_last():
+    streams, before = (sys.stdout, sys.stderr), set(threading.enumerate())
+    many = tuple(TopicSnapshot(f"/topic_{k}", 1, 1.0, 0.0) for k in range(40))
+    crowded = replace(SNAPSHOT, topics=many)
+    with terminal() as (ours, stream):
+        shown = Terminal(stream)
+        shown.show(crowded)
+        drawn = read_until(ours, "the connection is lost")
+        (thread,) = set(threading.enumerate()) - before
+        assert (thread.name, thread.daemon) == ("terminal", True)
+        assert (sys.stdout, sys.stderr) == streams
+        assert shown.close()
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", drawn).replace("\r", "")
+    assert text.strip().split("\n") == [line.rstrip() for line in rows(crowded, 100, 29)]
 
 
 @pytest.mark.slow
