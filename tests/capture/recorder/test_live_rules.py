@@ -325,6 +325,18 @@ def test_a_relay_is_started_with_its_socket_and_options(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_relay_leads_a_session_that_no_interrupt_of_the_terminal_reaches(tmp_path, monkeypatch):
+    script = tmp_path / "relay"
+    script.write_text("#!/bin/sh\necho session $(cut -d' ' -f6 /proc/self/stat)\n")
+    script.chmod(0o700)
+    monkeypatch.setattr(live_feed, "sys", SimpleNamespace(executable=str(script)))
+    monkeypatch.setattr(live_feed.importlib.util, "find_spec", lambda _: True)
+    relay = spawn_relay(tmp_path / "s")
+    wait_for(lambda: relay.poll() is not None, "its end")
+    assert relay.complaint() == f"session {relay.pid}"
+    relay.close()
+
+
 def test_a_relay_that_can_not_be_started_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(live_feed.tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(live_feed, "sys", SimpleNamespace(executable=str(tmp_path / "none")))
