@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from support.frozen_records import mutable_dataclasses
 from support.simulated_clock import SimulatedClock
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.process import StopRequest
@@ -216,12 +215,3 @@ def test_what_a_connection_still_brings_is_received_for_5_s_at_most(
     assert line.polled_ns[-1] <= (most_s + 0.5) * NS
     # A frame from after the end proves that all earlier ones have come.
     assert recorded(tmp_path / "run.mcap") == line.counts.frames - refused
-
-
-def test_what_is_handed_on_can_not_be_changed():
-    assert mutable_dataclasses("undulog.capture.recorder") == {
-        "LiveCounts",
-        "SourceLink",
-        "_Client",
-        "_Topic",
-    }

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from support.frozen_records import mutable_dataclasses
 from support.read_back import decoded_of, messages_of
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import DataError
@@ -169,7 +168,3 @@ def test_a_time_that_no_stamp_holds_is_refused(tmp_path, t_ns):
         none = np.empty((2, 0))
         with pytest.raises(DataError, match="32 bits"):
             channel.write_rows(np.array([5, t_ns]), np.zeros((2, 1)), none, none)
-
-
-def test_what_is_handed_on_can_not_be_changed():
-    assert mutable_dataclasses("undulog.capture.log.write") == set()
