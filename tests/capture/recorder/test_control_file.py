@@ -137,6 +137,10 @@ def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
     with polled(second), control_client.ControlClient(path) as client:
         client.ask({"do": "x"})
     second.close()
+    third = ControlServer(path, echo)  # perhaps of the same inode
+    second.close()
+    assert path.is_socket()
+    third.close()
 
 
 def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_in(tmp_path):
