@@ -94,7 +94,8 @@ OTHERS = {"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
 
 
 @pytest.mark.parametrize(
-    "environ", [{}, OTHERS, *({"WATCHDOG_USEC": text} for text in ("0", "soon", "-5"))]
+    "environ",
+    [{}, OTHERS, *({"WATCHDOG_USEC": text} for text in ("0", "soon", "-5", "²", "٣", " 5"))],
 )
 def test_a_watchdog_that_is_not_ours_or_no_time_is_not_fed(manager, environ, notifier_of):
     name, listener = manager
@@ -104,9 +105,26 @@ def test_a_watchdog_that_is_not_ours_or_no_time_is_not_fed(manager, environ, not
     assert heard(listener) == []
 
 
+def test_who_is_a_service_and_how_often_its_watchdog_is_fed(manager, notifier_of):
+    name, listener = manager
+    notifier = notifier_of({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1"})
+    assert (notifier.is_service, notifier.watchdog_ns, notifier.failed) == (True, 1000, 0)
+    for now_ns in (0, 499, 500, 999, 1000, 1001):
+        notifier.alive(now_ns)
+    assert heard(listener) == [["WATCHDOG=1"]] * 3
+    notifier.ready()
+    notifier.status("")  # as it was
+    notifier.status(" \n ")
+    assert heard(listener) == [["READY=1"]]
+    notifier.stopping()
+    notifier.status("a")
+    assert heard(listener) == [["STOPPING=1"], ["STATUS=a"]]
+
+
 @pytest.mark.parametrize("name", ["", "relative/path", "vsock:2:1234"])
 def test_without_a_manager_nothing_happens(name, notifier_of):
     notifier = notifier_of({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1000"})
+    assert not notifier.is_service
     notifier.ready("x")
     notifier.alive(10**12)
     notifier.stopping()

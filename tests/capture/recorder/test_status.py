@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from support.simulated_clock import SimulatedClock
+from undulog.capture.common.clock import Clock
 from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.source_clock import ClockEstimate
 from undulog.capture.recorder.status import (
@@ -74,6 +75,24 @@ def test_a_task_that_is_late_by_a_second_is_not_run_twice():
     assert len(done) == 4
     schedule.run(6_000_000_000)
     assert len(done) == 5
+
+
+def test_the_start_of_a_session_is_in_the_middle_of_two_looks_at_the_monotonic_clock():
+    looks = iter([1000, 1007, 5000])
+    clock = SessionClock(Clock(lambda: next(looks), lambda: 70_000, int))
+    assert (clock.epoch_ns, clock.now_ns()) == (70_000, 70_000 - 1003 + 5000)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_tasks_are_spread_over_the_first_second_and_then_each_a_second_apart(count):
+    done, begin_ns = [], 77
+    schedule = EachSecond([lambda k=k: done.append((now_ns, k)) for k in range(count)], begin_ns)
+    steps_ns = 10**9 // (count + 1)
+    due = [(begin_ns + second * 10**9 + (k + 1) * steps_ns, k)
+           for second in range(3) for k in range(count)]  # fmt: skip
+    for now_ns in sorted(at_ns - early for at_ns, _ in due for early in (0, 1)):
+        schedule.run(now_ns)
+    assert done == due
 
 
 # -- the recorder and the session -----------------------------------------------------------------
@@ -182,6 +201,17 @@ def test_values_of_a_source():
         of("source can0", sources=(dataclasses.replace(SOURCE, dropped=0),)).values["dropped"]
         == "0"
     )
+
+
+def test_what_is_not_given_of_a_source_or_a_recorder_is_zero_or_left_out():
+    found = of("source b", sources=(SourceSnapshot("b", "x", connected=True),))
+    none = dict.fromkeys(("frames", "malformed", "error_frames", "reconnects"), "0")
+    assert (found.level, found.message, found.values) == (OK, "connected", none)
+    recorder = of().values
+    assert (recorder["backlog_frames"], recorder["unsynced_messages"]) == ("0", "0")
+    group = of("topics x", topics=(TopicSnapshot("/x", 1, None, 0.5),)).values
+    assert (group["nan"], group["oldest_s"], group.get("jitter")) == ("0", "0.5", None)
+    assert SNAPSHOT.events == ()
 
 
 # -- topics ---------------------------------------------------------------------------------------
