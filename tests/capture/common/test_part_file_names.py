@@ -148,6 +148,20 @@ def test_syncing_and_publishing_leave_no_file_open(tmp_path):
     assert descriptors() <= before
 
 
+def test_names_of_the_working_folder_are_given_as_absolute_ones_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    part, output = Path("a.part"), Path("a")
+    for replace in (False, True):
+        part.write_text(f"{replace}")
+        publish(part, output, replace=replace)
+        assert (names(tmp_path), output.read_text()) == (["a"], f"{replace}")
+    part.write_text("new")
+    with pytest.raises(FileExistsError) as caught:
+        publish(part, output, replace=False)
+    assert (caught.value.filename, caught.value.filename2) == ("a.part", "a")
+    assert names(tmp_path) == ["a", "a.part"]
+
+
 # -- without renameat2 -----------------------------------------------------------------------------
 
 

@@ -64,6 +64,16 @@ def test_a_part_gets_its_name_when_it_is_whole(stream, folder):
     assert stream.close() == hashlib.sha256(LONG + b"more").hexdigest()
 
 
+def test_others_may_read_a_part_as_the_umask_has_it(folder):
+    former = os.umask(0o027)
+    try:
+        stream = PartStream(folder / "run.mcap", 1, force=False)
+    finally:
+        os.umask(former)
+    assert stream.place.stat().st_mode & 0o777 == 0o640
+    stream.discard()
+
+
 @pytest.mark.parametrize("name", ["run.mcap", "run.mcap.part"])
 def test_an_earlier_file_is_replaced_only_by_force(folder, name):
     earlier = folder / name
