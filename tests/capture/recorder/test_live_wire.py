@@ -104,14 +104,14 @@ def test_a_datagram_is_read_whole_or_refused_wherever_it_is_cut():
 
 @pytest.mark.parametrize("beyond", [0, 1])
 def test_a_definition_has_16_mib_at_most(beyond):
-    empty = len(pack_definition(Attachment(0, 0, "robot.toml", "text", b""))[1])
-    body = bytes(16 * MIB + beyond - empty)
-    data = datagram(pack_description(Attachment(0, 0, "robot.toml", "text", body)))
+    size = 16 * MIB + beyond - struct.calcsize("<HIII")
+    body = struct.pack("<HIII", 1, 0, 0, size) + bytes(size)  # a schema without names
+    data = datagram(record_of(Opcode.SCHEMA, zlib.compress(body, 1)))
     if beyond:
         with pytest.raises(DataError, match="too long or cut short"):
             read_records(data)
     else:
-        assert len(read_records(data)[0].data) == len(body)
+        assert len(read_records(data)[0].data) == size
 
 
 def _schema(text):

@@ -203,12 +203,11 @@ def test_the_last_tick_is_the_first_at_or_after_the_duration(stage_of, time, dur
 
 
 @pytest.mark.parametrize(
-    ("bursts", "polls"),
-    [((), 3), ((0,), 4), ((2,), 6), ((1, 3, 5), 9), ((0, 1, 2), 6)],
+    ("frames", "bursts", "polls"),
+    [(1000, (), 3), (1000, (0,), 4), (1000, (1, 3, 5), 9), (1000, (0, 2), 6), (999, (0, 2), 3)],
 )
-@pytest.mark.parametrize("frames", [999, 1000])
 def test_a_connection_is_emptied_until_three_ticks_bring_no_burst(
-    stage_of, time, bursts, polls, frames
+    stage_of, time, frames, bursts, polls
 ):
     """The poll that ended the recording is the first; a later one that drains follows."""
     source = Line(time, frames=lambda k: frames if k - 1 in bursts else 0)
@@ -216,12 +215,11 @@ def test_a_connection_is_emptied_until_three_ticks_bring_no_burst(
     source.robot = None
     source.connected = False  # nothing to wait for after that
     stage.run(0.0)
-    count = polls if frames == 1000 else 3
     steps = [b - a for a, b in zip(source.polled_ns, source.polled_ns[1:], strict=False)]
-    assert steps[1:] == [TICK_NS] * (count - 1) + [0]
+    assert steps[1:] == [TICK_NS] * (polls - 1) + [0]
 
 
-@pytest.mark.parametrize(("pause_s", "polls"), [(0.0, 250), (0.02, 249), (7.0, 249)])
+@pytest.mark.parametrize(("pause_s", "polls"), [(0.0, 250), (7.0, 249)])
 def test_a_connection_without_end_is_received_for_5_s_of_running_time(
     stage_of, time, pause_s, polls
 ):

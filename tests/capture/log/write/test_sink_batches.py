@@ -53,14 +53,14 @@ def states_of(sinks):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"split_ns": 50}, {"split_size": 1 << 16}, {"segment_size": 1 << 13},
-     {"split_ns": 200, "split_size": 1 << 15, "flush_interval_s": 4.0}],
+    [{}, {"split_ns": 800}, {"split_size": 1 << 16}, {"segment_size": 1 << 13},
+     {"split_ns": 900, "split_size": 1 << 15, "flush_interval_s": 4.0}],
 )  # fmt: skip
 def test_a_batch_is_as_its_messages_one_by_one(sink_of, now, options):
     """At each moment: messages, part and its bytes; and in the files."""
     single, many = sinks = sink_of(**options), sink_of(**options)
     rng, log_ns = random.Random(1), 1000
-    for number in range(60):
+    for number in range(48):
         messages = []
         for k in range(rng.choice([0, 1, 1, 2, 5, 20])):
             log_ns += rng.choice([0, 1, 7, 30])
