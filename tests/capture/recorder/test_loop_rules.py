@@ -1,6 +1,7 @@
 """The recorder's loop to the nanosecond: when it decodes, when it ends, and what it waits for."""
 
 from collections import Counter
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from undulog.capture import SessionWriter
 from undulog.capture.bus.decoding import FrameTally
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.recorder import loop
 from undulog.capture.recorder.loop import Recorder
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import ClockDomain
@@ -123,7 +125,8 @@ def time():
 
 
 @pytest.fixture
-def stage_of(tmp_path):
+def stage_of(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_manual_collection", nullcontext)  # which takes most of the time
     made = []
 
     def make(*sources, **options):

@@ -53,6 +53,8 @@ class Stage:
 
     def __init__(self, folder, monkeypatch):
         self.folder, self.time, self.shown = folder, SimulatedClock(), []
+        nothing = contextlib.nullcontext  # a collection takes most of the time
+        monkeypatch.setattr("undulog.capture.recorder.loop._manual_collection", nothing)
         monkeypatch.setattr(recording, "SessionClock", lambda: SessionClock(self.time.clock))
         monkeypatch.setattr(recording, "FreeSpace", lambda _: Free())
         monkeypatch.setattr(recording, "open_sources", lambda _: self.sources)
