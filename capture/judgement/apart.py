@@ -15,7 +15,7 @@ from ..common.arrays import FloatArray
 from .exposure import LIKE_LAG_S, Exposure, responds
 from .fault import Apart
 from .levels import ENOUGH_LIKE, QUARTER, TINY
-from .motion import Course
+from .motion import Course, Samples
 
 
 def find_apart(
@@ -67,7 +67,7 @@ def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[flo
 
 def _slope(course: Course, exposure: Exposure, k: int) -> float:
     """Return the slope of a joint's position over its command as late as its response."""
-    late = np.interp(course.t_s - exposure.responses[k].lag_s, course.t_s, course.command[k])
-    known = course.present[k]
-    asked, seen = late[known] - late[known].mean(), course.position[k][known]
+    known, lag_s = course.present[k], exposure.responses[k].lag_s
+    late = Samples(course.t_s, course.command[k]).at(course.t_s[known] - lag_s)
+    asked, seen = late - late.mean(), course.position[k][known]
     return float(asked @ seen) / max(float(asked @ asked), TINY)
