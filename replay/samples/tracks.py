@@ -391,16 +391,14 @@ def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArr
     found = np.full((at_ns.size, *values.shape[1:]), np.nan)
     if not t_ns.size:
         return found
-    left = np.searchsorted(t_ns, at_ns, side="right") - 1
-    inside = left >= 0
-    exact = inside & (t_ns[np.maximum(left, 0)] == at_ns)
+    left = np.searchsorted(t_ns, at_ns, side="right") - 1  # -1, the last, where none is earlier
+    exact = t_ns[left] == at_ns
     found[exact] = values[left[exact]]
-    if t_ns.size > 1:
-        between = inside & ~exact & np.append(~gaps(t_ns), False)[np.maximum(left, 0)]
-        i = left[between]
-        share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
-        share = share.reshape(-1, *[1] * (values.ndim - 1))
-        found[between] = (1.0 - share) * values[i] + share * values[i + 1]
+    between = ~exact & np.append(~gaps(t_ns), False)[left]  # nothing follows the last
+    i = left[between]
+    share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
+    share = share.reshape(-1, *[1] * (values.ndim - 1))
+    found[between] = (1.0 - share) * values[i] + share * values[i + 1]
     return found
 
 
@@ -420,9 +418,7 @@ def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
     if not t_ns.size:
         return found
     left = np.searchsorted(t_ns, at_ns, side="right") - 1
-    age = at_ns - t_ns[np.maximum(left, 0)]
-    limit = GAP_STEPS * typical_step_ns(t_ns) if t_ns.size > 1 else 0.0
-    known = (left >= 0) & (age <= limit)
+    known = (left >= 0) & (at_ns - t_ns[left] <= GAP_STEPS * typical_step_ns(t_ns))
     found[known] = values[left[known]]
     return found
 
