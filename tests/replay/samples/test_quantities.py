@@ -94,6 +94,7 @@ def test_what_is_plotted_of_columns():
         ("/gait", "position"): one,
         ("/warm", "position"): one,
         ("/warm", "velocity"): one,
+        ("/warm", "effort"): one,
         ("/none", "position"): (),
     }
     found = quantities.quantities(columns)
@@ -211,10 +212,10 @@ def test_the_power_of_all_links_sets_the_colour(opened, snake):
 
 
 def test_of_many_samples_some_thousand_are_kept(opened):
-    t = np.arange(9000) / 1000
-    session = opened(("/joint_states", ("a",), t, np.arange(9000)))
+    t = np.arange(8000) / 1000
+    session = opened(("/joint_states", ("a",), t, np.arange(8000)))
     (line,) = quantities.survey(session, 50.0).samples["/joints/measured"]
-    np.testing.assert_array_equal(line.values, np.arange(0, 9000, 3))  # 1 + 9000 // 4000
+    np.testing.assert_array_equal(line.values, np.arange(0, 8000, 3))  # 1 + 8000 // 4000
     some = opened(("/joint_states", ("a",), t[:3999], np.arange(3999)))
     (line,) = quantities.survey(some, 50.0).samples["/joints/measured"]
     assert line.values.size == 3999
@@ -301,6 +302,7 @@ def test_places_of_three_joints_are_head_middle_tail():
     assert three.labelled == {"a": "head", "b": "middle", "c": "tail"}
     assert content.Places(("a", "b"), None).labelled == {"a": "a", "b": "b"}
     assert content.line_title("a", "head") == "a head"
+    assert content.line_title("joint01", "head") == "joint01 head"
     assert content.line_title("a", "a") == "a"
 
 
