@@ -205,10 +205,8 @@ def sample_weights(t_s: FloatArray, start_s: float, stop_s: float) -> FloatArray
     Returns:
         Weights [s], shape (n,); their sum over the window's length is the coverage.
     """
-    if t_s.size == 0:
-        return np.zeros(0)
-    if t_s.size == 1:
-        return np.zeros(1)
+    if t_s.size < 2:
+        return np.zeros(t_s.size)
     around_the_end = (t_s[0] - start_s) + (stop_s - t_s[-1])
     half = np.concatenate(([around_the_end], np.diff(t_s), [around_the_end])) / 2
     inner = half[1:-1]
