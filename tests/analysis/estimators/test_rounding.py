@@ -79,6 +79,19 @@ def test_a_step_is_the_common_measure_of_all_differences():
     assert _common_step(rough, 1e-5) == pytest.approx(rough.sum() / 10, rel=1e-12)
 
 
+def test_a_lattice_of_any_multiples_is_found():
+    """Euclid's algorithm on differences that are off by up to the blur."""
+    rng = np.random.default_rng(11)
+    for _ in range(200):
+        counts = np.unique(rng.integers(1, 40, rng.integers(4, 9)))
+        step, blur = rng.uniform(0.5, 2.0), 1e-7
+        apart = step * counts + 0.4 * blur * rng.uniform(-1, 1, counts.size)
+        common = step * np.gcd.reduce(counts)
+        mean = apart.sum() / np.rint(apart / common).sum() if counts.size >= 4 else 0.0
+        for differences in (rng.permutation(apart), np.append(apart, 0.9 * blur)):
+            assert _common_step(differences, blur) == pytest.approx(mean, rel=1e-12)
+
+
 def draw_errors(count, amplitude, noise, *, turned, seed=5):
     """Errors of the fundamental over motions like the fitted, rounded to the lattice."""
     rng = np.random.default_rng(seed)
@@ -113,10 +126,12 @@ def test_the_fundamental_of_a_rounded_wave_scatters_as_when_it_is_rounded(amplit
     assert (np.linalg.eigvalsh(fitted) > 0).all()
 
 
-def test_draws_are_those_of_their_definition():
+@pytest.mark.parametrize("size", [0.005, 0.3, 1.2])
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_draws_are_those_of_their_definition(size, noise):
     """Amplitude and, in every second draw, phase differ; the mean stays."""
     t = np.arange(500) / 50
-    series = Series("q", t, STEP * np.rint((0.3 * np.cos(np.pi * t + 0.3) + 0.004) / STEP))
+    series = Series("q", t, STEP * np.rint((size * np.cos(np.pi * t + 0.3) + 0.004) / STEP))
     model = HarmonicModel(harmonics=2)
     fit = fit_at([Series("p", t, np.cos(np.pi * t)), series], np.pi, model)
     fundamental = fit.fundamental[1]
@@ -127,13 +142,17 @@ def test_draws_are_those_of_their_definition():
     moving = parts @ design[1:]
     ahead = (1j * fundamental * np.exp(1j * np.pi * t)).real
     rng = np.random.default_rng(0)
-    size = 1 + min(8 * STEP / abs(fundamental), 0.2) * rng.uniform(-1, 1, 48)
+    reach = min(8 * STEP / max(abs(fundamental), STEP), 0.2)
+    larger = 1 + reach * rng.uniform(-1, 1, 48)
     angle = np.pi / 50 / 2 * rng.uniform(-1, 1, 48)
     angle[::2] = 0.0
     mean = fit.trend[1, 0] - _origin(fit.trend[1, 0], series.values[0], STEP)
-    place = (mean + size[:, None] * moving + angle[:, None] * ahead) / STEP
-    error = STEP * (np.rint(place) - place) @ (inverse @ design).T
+    place = (mean + larger[:, None] * moving + angle[:, None] * ahead) / STEP
+    moved = place
+    if noise:
+        moved = place + noise / STEP * rng.standard_normal(place.shape, np.float32)
+    error = STEP * (np.rint(moved) - place) @ (inverse @ design).T
     kept, turned = (half.T @ half / 24 for half in (error[::2], error[1::2]))
     expected = turned + not_negative(kept - turned)
-    result = rounding_covariance(series, fit, 1, STEP, 0.0)
+    result = rounding_covariance(series, fit, 1, STEP, noise)
     np.testing.assert_allclose(result, expected, rtol=1e-6)
