@@ -254,7 +254,7 @@ def _turned(harmonic: FloatArray, model: HarmonicModel) -> FloatArray:
 
 def _weights(moments: Moments, rss: FloatArray, model: HarmonicModel) -> FloatArray:
     """One over each channel's residual variance; 0 for a channel that is constant."""
-    noise = np.maximum(rss, RELATIVE_FLOOR * moments.power) / max(moments.count - model.size, 1)
+    noise = np.maximum(rss, RELATIVE_FLOOR * moments.power) / (moments.count - model.size)
     return np.divide(1.0, noise, out=np.zeros_like(noise), where=noise > 0)
 
 

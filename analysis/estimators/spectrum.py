@@ -167,7 +167,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
-    floor = np.maximum(RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0) - level, 0.0)
+    floor = np.maximum(RELATIVE_FLOOR * fit.total / fit.count - level, 0.0)
     level += floor
     first = fit.model.first
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
@@ -302,7 +302,7 @@ class _Demodulated:
 
 def _span(one: Series) -> float:
     """Return the length of a record, the last sample's own interval included [s]."""
-    return float(one.t_s[-1] - one.t_s[0]) * one.count / max(one.count - 1, 1)
+    return float(one.t_s[-1] - one.t_s[0]) * one.count / (one.count - 1)
 
 
 def _demodulated(
