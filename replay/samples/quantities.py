@@ -245,7 +245,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     if looks:
         read_ns = sum(stop_ns - start_ns for start_ns, stop_ns in looks)
         share = read_ns / (session.end_ns - session.start_ns)
-        begin = session.view(start_ns=looks[0][0], stop_ns=looks[0][1])
+        begin = session.view(stop_ns=looks[0][1])
     wanted = _carried(begin)
     every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in wanted}
     thin = max(every.values(), default=1)
