@@ -76,6 +76,15 @@ def test_a_transient_that_outlasts_half_of_the_window_is_a_drift():
         assert slow_changes(series, place, noise).trend is trend
 
 
+def test_five_cycles_are_enough_for_a_drift():
+    rng = np.random.default_rng(8)
+    for count, trend in ((5, Trend.DRIFTING), (4, Trend.STEADY)):
+        place = np.arange(float(count))
+        series = 1 + 0.1 * place + 1e-3 * rng.normal(size=(8, count))
+        found = slow_changes(series, place, CycleNoise(np.full(8, 2e-6), 0.01, np.ones(count)))
+        assert found.trend is trend
+
+
 def test_a_time_constant_and_a_change_are_found_where_only_lags_settle():
     rng = np.random.default_rng(5)
     sizes = np.r_[0.0, 0.0, 0.0, 0.2, -0.3, 0.4][:, None]

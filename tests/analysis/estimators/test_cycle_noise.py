@@ -1,5 +1,6 @@
 """The response in each cycle of several runs, some of them short, against plain loops."""
 
+import itertools
 import math
 
 import numpy as np
@@ -150,12 +151,8 @@ def test_holes_are_those_of_a_loop():
         t, usual = series.t_s, np.median(np.diff(series.t_s))
         edges = np.sort(rng.uniform(t[0] - 3.0, t[-1] + 3.0, 8))
         expected = []
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
-            missing = [
-                a < high and b > low
-                for a, b in zip(t[:-1], t[1:], strict=True)
-                if b - a > 3 * usual
-            ]
+        for low, high in itertools.pairwise(edges):
+            missing = [a < high and b > low for a, b in itertools.pairwise(t) if b - a > 3 * usual]
             expected.append(any(missing) or t[0] - low > usual or high - t[-1] > usual)
         assert _holes(series, edges).tolist() == expected
 

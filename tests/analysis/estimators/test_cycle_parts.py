@@ -126,6 +126,11 @@ def test_cycles_are_summed_few_at_a_time(monkeypatch):
     sizes.clear()
     _moments(np.linspace(0, 60, 400), np.ones(400), np.arange(0, 401, 200))
     assert sizes == [200, 200]
+    monkeypatch.undo()
+    monkeypatch.setattr(demodulation, "cos_sin", counted)
+    sizes.clear()
+    _moments(np.linspace(0, 60, 9000), np.ones(9000), np.arange(9001))
+    assert sizes == [8192, 808]
 
 
 def test_an_amplitude_is_least_squares_of_two_harmonics():

@@ -151,6 +151,7 @@ def test_changes_are_a_slope_or_the_start_of_a_transient():
 def test_slices_cover_all_trends():
     assert [(part.start, part.stop) for part in _parts(7, 10_000)] == [(0, 3), (3, 6), (6, 9)]
     assert [part.start for part in _parts(2, 10**6)] == [0, 1]
+    assert [part.start for part in _parts(40_000, 1)] == [0, 32_768]
 
 
 @pytest.mark.parametrize("alike", [False, True])

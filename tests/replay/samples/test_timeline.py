@@ -85,6 +85,12 @@ def test_rows_with_and_without_a_phase_are_chunks_of_their_own():
     ]
 
 
+def test_a_chunk_has_4096_rows():
+    t = np.arange(10_000, dtype=np.int64)
+    parts = [(rows.start, rows.stop) for rows, _ in Clock(0).rows(t)]
+    assert parts == [(0, 4096), (4096, 8192), (8192, 10_000)]
+
+
 def test_a_cycle_is_rounded_to_its_nanosecond():
     t = np.arange(4, dtype=np.int64)
     found = gathered(Clock(0, Rhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
