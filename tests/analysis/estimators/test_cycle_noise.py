@@ -108,6 +108,18 @@ def test_a_few_samples_within_the_phase_are_no_cycle(count):
     assert not explained.any()
 
 
+@pytest.mark.parametrize(("count", "there"), [(11, False), (12, True)])
+def test_each_cycle_needs_twelve_samples_of_its_own(count, there):
+    _, phase = wave()
+    phase = Phase(phase.t_s, phase.value - 0.2)  # cycles begin at half seconds
+    t = (np.arange(8 * count) + 0.5) / count
+    amplitude, explained = _amplitudes(
+        Series("q", t, np.cos(2 * np.pi * t)), phase, phase.edges_s()
+    )
+    assert np.isfinite(amplitude[1:-1]).tolist() == [there] * (amplitude.size - 2)
+    np.testing.assert_allclose(explained[1:-1], float(there), atol=1e-3)
+
+
 def test_a_command_at_the_least_share_counts():
     """A power of an amplitude a is a^2 / 2; its mean over a cycle is taken off before."""
     t, phase = wave(100.0)
