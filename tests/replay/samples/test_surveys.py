@@ -109,6 +109,13 @@ def test_joints_in_turn_are_one_part_where_a_robot_logs_when_it_sampled(session)
         assert survey(both, 50.0).parts["/joints/measured"] == (("a", "b"),)
 
 
+def test_a_picture_is_drawn_when_the_first_joint_was_measured(session):
+    t = np.arange(60) / 10
+    values = np.stack([np.where(np.arange(60) % 4 == 1, 1.0, np.nan), np.ones(60)], axis=1)
+    found = survey(session(t, {"/joint_states": (["seldom", "often"], "rad", values)}), 50.0)
+    np.testing.assert_array_equal(found.drawing_ns, EPOCH_NS + np.round(t[1::4] * NS).astype(int))
+
+
 def test_parts_of_two_surveys_are_the_classes_of_both():
     rng = np.random.default_rng(6)
     names = list("abcdefg")
