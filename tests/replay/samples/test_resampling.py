@@ -19,7 +19,7 @@ def times(*values):
 def records():
     """Times that lie close together, coincide and have gaps; values with holes."""
     rng = np.random.default_rng(12)
-    for number in range(70):
+    for number in range(50):
         steps = rng.choice([0, 1, 2, 3, 5, 6, 10, 11, 15, 16, 30], rng.integers(0, 9))
         t = 7 + np.cumsum(steps).astype(np.int64)
         shape = (t.size,) if number % 2 else (t.size, 2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.written_topics import EPOCH_NS, write_topics
-from undulog.capture import Session, load_robot
+from undulog.capture import Session
 from undulog.replay.samples import quantities, timeline
 from undulog.replay.samples.quantities import refined, survey
 
@@ -143,9 +143,9 @@ def test_parts_of_two_surveys_are_the_classes_of_both():
 # -- power and colours ----------------------------------------------------------------------------
 
 
-def test_power_colours_only_the_links_of_a_robot(session):
-    robot, t = load_robot("snake25"), np.arange(30) / 10
-    one = np.ones((30, 25))
+def test_power_colours_only_the_links_of_a_robot(session, snake25):
+    robot, t = snake25, np.arange(10) * 0.3
+    one = np.ones((10, 25))
     effort = np.where(t < 1.5, 1.0, 7.0)[:, None] * one
     topics = {"/joint_states": (robot.joint_names, "rad", one, 2.0 * one, effort)}
     plain, known = survey(session(t, topics), 50.0), survey(session(t, topics, robot=robot), 50.0)
