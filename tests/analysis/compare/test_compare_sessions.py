@@ -54,6 +54,7 @@ def by_key(comparison):
     return {(one.quantity, one.place): one for one in comparison.differences}
 
 
+@pytest.mark.slow
 def test_the_weakened_joint_is_named_with_its_true_difference(write):
     """B starts a third of a cycle later: phases of the gait are compared, not times."""
     result = compared(write("a", 1), write("b", 2, late_s=0.34, change=weaken))
@@ -86,6 +87,7 @@ def test_mean_cycles_differ_as_in_closed_form(write, wave):
     assert max(result.waveforms, key=lambda one: one.rms_rad).name == "joint03"
 
 
+@pytest.mark.slow
 def test_two_runs_of_one_truth_are_equivalent(write):
     result = compared(write("a", 5), write("b", 6, late_s=0.5))
     alike = "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
@@ -173,6 +175,7 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, com
     assert "Mean cycles by gait phase" in html
 
 
+@pytest.mark.slow
 def test_a_page_is_not_replaced_unasked(write, tmp_path, command):
     page = tmp_path / "page.html"
     page.write_text("mine")
@@ -197,6 +200,7 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
     assert "a copy is not a run of its own" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -235,12 +239,14 @@ def sparse(tmp_path):
     return make
 
 
+@pytest.mark.slow
 def test_cycles_of_few_samples_are_compared_by_the_whole(sparse):
     result = compared(sparse("first", 0.95), sparse("other", 0.8))
     assert result.verdict == "different"
     assert result.answer.startswith("B differs from A: c most, gain −15.")  # 0.8 of 0.95
 
 
+@pytest.mark.slow
 def test_values_beyond_any_unit_are_left_out(sparse):
     with Session.open(sparse("huge", 0.95, largest=1.7e308)) as session:
         columns = read_columns(session, "/joint_commands", "/joint_states", print)

@@ -71,6 +71,7 @@ def walk(chains, rng, duration_s, noise, kick, *, every_s=5.0, steps=5):
     return np.stack(found, axis=1)
 
 
+@pytest.mark.slow
 def test_heterogeneous_couplings_are_recovered_from_noisy_kicked_phases():
     off, inside = [], []
     rng = np.random.default_rng(0)
@@ -130,6 +131,7 @@ def test_exactly_constant_differences_are_singular():
     assert coupling.condition_number is None or coupling.condition_number > 1e12
 
 
+@pytest.mark.slow
 def test_a_coupling_that_is_not_there_has_an_interval_from_zero():
     rng = np.random.default_rng(8)
     chain = Planted(rng, 6)

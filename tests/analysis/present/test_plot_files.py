@@ -69,6 +69,7 @@ def test_each_figure_of_the_page_is_a_file(kind, run, tmp_path, command):
     command(*line, "--force")
 
 
+@pytest.mark.slow
 def test_each_page_has_a_folder_of_its_own(run, tmp_path, command):
     write_run(tmp_path / "other.mcap")
     pages = ("-o", tmp_path / "pages", "--plots", tmp_path / "figures")
@@ -80,6 +81,7 @@ def test_each_page_has_a_folder_of_its_own(run, tmp_path, command):
     assert "is a file; name a folder for the figures" in command(*line, code=2).err
 
 
+@pytest.mark.slow
 def test_colours_of_the_page_become_those_of_paper(tmp_path):
     sentinel = next(each for each, name in CSS_VARIABLES.items() if name == "var(--reference)")
     with kept_figures() as drawn, drawing(2.0, 2.0) as figure:
@@ -130,6 +132,7 @@ def test_a_matrix_has_the_colours_of_its_cells(count, small, tmp_path):
         np.testing.assert_allclose(image[int(scale * y), int(scale * x)] / 255, expected, atol=0.03)
 
 
+@pytest.mark.slow
 def test_texts_of_a_matrix_are_those_that_a_page_shows():
     drawn = {text.get_text() for text in figure_of(matrix_picture(entries(4), "m").svg).findobj(
         lambda artist: hasattr(artist, "get_text") and artist.get_text()
@@ -138,6 +141,7 @@ def test_texts_of_a_matrix_are_those_that_a_page_shows():
     assert not any(text.startswith("±") for text in drawn)  # only shown when a row has the focus
 
 
+@pytest.mark.slow
 def test_mixtures_are_those_of_css():
     # color-mix(in oklab, red 50%, blue), https://www.w3.org/TR/css-color-5/#color-mix
     np.testing.assert_allclose(255 * _mixed("#ff0000", "#0000ff", 0.5), (140, 83, 162), atol=0.6)

@@ -56,6 +56,7 @@ def test_a_session_of_the_twin(report_of):
     assert result["energy"] is not None
 
 
+@pytest.mark.slow
 def test_a_result_that_lacks_a_key_or_has_another_type_is_none(report_of):
     result = report_of("analyse", GOLDEN)
     result["joints"][0]["gain"] = "high"

@@ -36,6 +36,7 @@ def slither(tmp_path_factory):
     return write(path, 2 * np.pi * np.array([1.432, 0.954]), group, waves, np.ones(16))
 
 
+@pytest.mark.slow
 def test_every_joint_is_compared_at_its_own_frequency(slither):
     result = analysed(slither)
     assert [len(one.joints) for one in result.gait.groups] == [8, 8]
@@ -117,6 +118,7 @@ def test_a_reversal_of_one_group_only_is_none(tmp_path):
     assert any("in some groups only" in text for text in result.warnings)
 
 
+@pytest.mark.slow
 def test_compared_at_their_own_frequencies(tmp_path, command):
     group = np.arange(8) // 4
     omegas = 2 * np.pi * np.array([0.8, 0.5])

@@ -103,6 +103,7 @@ def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
     assert float(jaw.note.split()[0]) == pytest.approx(2.343, rel=0.01)
 
 
+@pytest.mark.nightly
 def test_their_dead_bands_explain_their_gains(arm):
     found = {joint.name: joint for joint in arm.joints if joint.dead_band is not None}
     assert set(found) == set(JOINTS) - {"Jaw"}  # whose band is below four steps of its encoder

@@ -44,6 +44,7 @@ def layouts():
             yield "big_endian", motorola(position), length
 
 
+@pytest.mark.slow
 def test_integers_of_every_layout(rng):
     data = rng.integers(0, 256, (3, 8), dtype=np.uint8)
     data[0] = 255
@@ -53,6 +54,7 @@ def test_integers_of_every_layout(rng):
             assert BitField.of(signal).values(data).tolist() == reference(signal, data), signal
 
 
+@pytest.mark.slow
 @settings(max_examples=400, deadline=None)
 @given(
     position=st.integers(0, 511),

@@ -22,6 +22,7 @@ from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
 
 
+@pytest.mark.slow
 @settings(max_examples=400, deadline=None)
 @given(
     position=st.integers(0, 63),

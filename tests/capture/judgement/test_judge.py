@@ -98,6 +98,7 @@ def test_a_gait_of_fewer_than_three_samples_a_cycle_accuses_nobody(chain, lost):
     assert chain.judged() == {}
 
 
+@pytest.mark.slow
 def test_all_joints_inverted_are_not_named_wrongly():
     chain = Chain(25, step=-np.pi / 6)
     chain.position *= -1
@@ -150,6 +151,7 @@ def test_effort_of_the_servos_own_loop_tells_no_frozen_sensor_from_a_jam(chain):
     assert set(chain.judged("effort")["j4"].kinds) == {"jammed", "frozen_sensor"}
 
 
+@pytest.mark.slow
 def test_a_dead_joint_has_no_effort(chain):
     chain.position[BROKEN] = chain.rng.normal(0, NOISE, chain.t.size)
     chain.velocity[BROKEN] = chain.effort[BROKEN] = 0.0
@@ -160,6 +162,7 @@ def test_a_dead_joint_has_no_effort(chain):
     assert chain.judged("effort")["j4"].kinds == ("dead",)
 
 
+@pytest.mark.slow
 def test_an_inverted_joint(chain):
     chain.position[BROKEN] *= -1
     assert chain.judged()["j4"].kinds == ("inverted", "inverted_sensor")
@@ -291,6 +294,7 @@ def test_a_zero_that_drifts_is_no_gain(chain):
     assert change.change == pytest.approx(0.12, rel=0.1)
 
 
+@pytest.mark.slow
 def test_two_kinds_of_servos_are_no_reason_to_doubt_the_names():
     chain = Chain(15, step=-2 * np.pi / 15)
     rear = np.arange(15) > 6
