@@ -61,7 +61,7 @@ ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py 
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
   $(addprefix tests/capture/log/,file health) \
   $(addprefix tests/capture/,bus judgement robot) \
-  $(addprefix tests/sim/,batch scenario twin)
+  $(addprefix tests/sim/,batch twin)
 PYTEST = $(BIN)/python -m pytest --durations 20
 WAITING = $(addprefix tests/analysis/,estimators experiment response) \
   $(addprefix tests/house/,test_package.py test_root_names.py) tests/replay tests/sim

@@ -112,6 +112,7 @@ def test_a_joint_that_is_dragged_may_be_dead_or_scaled(chain):
     assert set(chain.judged()["j4"].kinds) >= {"dead", "scaled_sensor"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 20), marks=pytest.mark.nightly)])
 def test_a_noisy_coarse_encoder_repeats_values_by_chance(seeds):
     for seed in seeds:

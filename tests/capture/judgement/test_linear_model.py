@@ -34,6 +34,13 @@ def judged(command, *positions):
     return {fault.joint: fault for fault in judge(motions).faults}
 
 
+SOME = [
+    name if name in ("chirp", "steps") else pytest.param(name, marks=pytest.mark.slow)
+    for name in COMMANDS
+]
+"""All of them, some by slow tests."""
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("joints", [1, 4])
@@ -42,7 +49,7 @@ def test_a_sound_servo_is_not_named_though_its_lag_passes_half_a_turn(name, join
     assert judged(command, *[response(command)] * joints) == {}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", SOME)
 def test_an_inverted_joint_is_named(name):
     command = COMMANDS[name]
     found = judged(command, -response(command), response(command), response(command))
@@ -50,7 +57,7 @@ def test_an_inverted_joint_is_named(name):
     assert found["j1"].kinds == ("inverted", "inverted_sensor")
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", SOME)
 def test_a_joint_that_stands_is_named(name):
     command = COMMANDS[name]
     still = 0.001 * np.random.default_rng(2).normal(size=T.size)
@@ -59,7 +66,14 @@ def test_a_joint_that_stands_is_named(name):
     assert "dead" in found["j2"].kinds
 
 
-@pytest.mark.parametrize("name", ["chirp", "falling", "logarithmic", "steps"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "chirp",
+        "steps",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("falling", "logarithmic")),
+    ],
+)
 def test_a_jam_in_the_middle_is_named_with_its_time(name):
     command = COMMANDS[name]
     stopped = response(command)

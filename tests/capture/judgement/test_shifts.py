@@ -55,7 +55,7 @@ def found(values, weights):
     ]
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.6])
+@pytest.mark.parametrize("rho", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_chance_alone_hardly_ever_makes_a_change(rho):
     rng = np.random.default_rng(7)
     wrong = 0
