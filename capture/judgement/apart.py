@@ -12,10 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import FloatArray
-from .exposure import LIKE_LAG_S, Exposure, responds
+from .exposure import LIKE_LAG_S, Exposure, median_response, responds
 from .fault import Apart
 from .levels import ENOUGH_LIKE, QUARTER, TINY
-from .motion import Course, Samples
+from .motion import Course
+from .response import Filtered, Response
 
 
 def find_apart(
@@ -23,8 +24,9 @@ def find_apart(
 ) -> list[Apart]:
     """Find the joints whose gain or lag lies apart from those of the others.
 
-    A gain does so by the response and by the slope of the position over the command: stick and play
-    at rests are no gain, but a response of few rests takes them for one.
+    A gain does so by the joint's own response and by the slope of its position over what the
+    others' median response makes of its command: a response of few rests takes their errors for
+    a gain and a slow motion.
 
     Apart is further from the nearest of them than twice their spread, and further than joints
     differ that count as like (:func:`.exposure.agrees`). Of five and more joints the spread is that
@@ -44,7 +46,8 @@ def find_apart(
         return []
     lags = _apart(np.array([exposure.responses[k].lag_s for k in kept]), LIKE_LAG_S)
     gains = _apart(np.array([exposure.responses[k].gain for k in kept]), 0.0)
-    slopes = _apart(np.array([_slope(course, exposure, k) for k in kept]), 0.0)
+    common = median_response([exposure.responses[k] for k in kept])
+    slopes = _apart(np.array([_slope(course, common, k) for k in kept]), 0.0)
     found = [Apart(names[kept[i]], "lag", *each) for i, each in lags.items()]
     found += [Apart(names[kept[i]], "gain", *gains[i]) for i in gains if i in slopes]
     return found
@@ -65,9 +68,9 @@ def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[flo
     return found
 
 
-def _slope(course: Course, exposure: Exposure, k: int) -> float:
-    """Return the slope of a joint's position over its command as late as its response."""
-    known, lag_s = course.present[k], exposure.responses[k].lag_s
-    late = Samples(course.t_s, course.command[k]).at(course.t_s[known] - lag_s)
-    asked, seen = late - late.mean(), course.position[k][known]
-    return float(asked @ seen) / max(float(asked @ asked), TINY)
+def _slope(course: Course, common: Response, k: int) -> float:
+    """Return the slope of a joint's position over what a response makes of its command."""
+    known = course.present[k]
+    asked = Filtered(course.command[k][None, :], course.step_s).output(common)[0][known]
+    asked = asked - asked.mean()
+    return float(asked @ course.position[k][known]) / max(float(asked @ asked), TINY)
