@@ -177,16 +177,16 @@ def _jump(k: int, quantity: str, run: Shift, edges_s: FloatArray) -> Jump:
 def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blocks) -> bool:
     """Return whether a change is one that matters: its interval isn't within the margin.
 
-    Without like joints, and where the motion is no rhythm, it is also beyond what a response leaves
-    of the joint's motion, and the command is no sweep: play, stick and poles beyond two make
-    another gain of every other motion.
+    Where the motion is no rhythm, it is also beyond what a response leaves of the joint's motion,
+    and the command is no sweep: play, stick and poles beyond two make another gain of every other
+    motion.
     """
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
         margin = 2 * NOISE_MARGIN if alone else NOISE_MARGIN
         return compared and not blocks.swept[k] and _reaches(run, margin)
-    lost = float(blocks.lost_rad[k]) if alone else 0.0
+    lost = 0.0 if blocks.half_s else float(blocks.lost_rad[k])
     if quantity in ("offset", "drift"):
         return _reaches(run, ANGLE_MARGIN_RAD) and abs(run.change) > lost
     inside = slice(run.first, run.last)
@@ -216,7 +216,9 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
     length_s = float(course.t_s[-1] - course.t_s[0])
     cycles = [cycle_s(command, course.step_s) / 2 for command in course.command]
     half = max((cycle for cycle in cycles if np.isfinite(cycle)), default=0.0)
-    shortest = max(length_s / MOST, 2 * _correlation_s(course, exposure, usable))
+    # A change makes the residual's correlation longer; what repeats is known without it.
+    parts = FEWEST if half else 1
+    shortest = max(length_s / MOST, 2 * _correlation_s(course, exposure, usable, parts))
     whole = max(1.0, np.ceil(shortest / half)) * half if half else shortest
     count = min(int(length_s / whole), MOST)
     if count < FEWEST:
@@ -324,18 +326,20 @@ def _regressed(
     return estimate.T, weights, left
 
 
-def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray) -> float:
-    """Return the median time after which the residuals' correlation is below 1/e."""
+def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray, parts: int) -> float:
+    """Return the median time after which the residuals' correlation is below 1/e in the parts."""
     times: list[float] = []
     for k in range(course.position.shape[0]):
         residual = (course.position[k] - exposure.fitted[k])[usable[k]]
+        width = residual.size // parts
         if residual.size < 2 * FEWEST:
             continue
-        residual = residual - residual.mean()
-        spectrum = np.abs(np.fft.rfft(residual, 2 * residual.size)) ** 2
-        correlation = np.fft.irfft(spectrum)[: residual.size]
-        below = np.flatnonzero(correlation < correlation[0] / np.e)
-        times.append(float(below[0] if below.size else residual.size) * course.step_s)
+        rows = residual[: parts * width].reshape(parts, width)
+        rows = rows - rows.mean(axis=1, keepdims=True)
+        correlation = np.fft.irfft(np.abs(np.fft.rfft(rows, 2 * width)) ** 2)[:, :width]
+        below = correlation < correlation[:, :1] / np.e
+        steps = np.where(below.any(axis=1), below.argmax(axis=1), width)
+        times.append(float(np.median(steps)) * course.step_s)
     return float(np.median(times)) if times else 0.0
 
 

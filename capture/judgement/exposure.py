@@ -24,7 +24,7 @@ from .levels import (
     REST_ERRORS,
     WHOLE,
 )
-from .motion import Course, JointMotion
+from .motion import Course, JointMotion, cycle_s
 from .response import SETTLED, Filtered, Response
 
 LIKE_LAG_S = 0.05
@@ -101,11 +101,21 @@ def exposure_of(
             usual = float(np.quantile(lost[group], WHOLE))
             of_like[k] = max(2 * REST_ERRORS * usual, HALF * float(np.ptp(course.command[k])))
         known = sound or [r for r in responses if responds(r)]
-        settling[k] = np.median([r.delay_s + SETTLED * r.constant_s for r in known]) if known else 0
+        settling[k] = (
+            np.median([r.delay_s + SETTLED * r.constant_s for r in known])
+            if known
+            else _half_cycle_s(course.command[k], course.step_s)  # all may be as late as that
+        )
     own = np.minimum(lost, LARGEST_REST_RAD)
     least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own), of_like)
     settling += course.step_s
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
+
+
+def _half_cycle_s(command: FloatArray, step_s: float) -> float:
+    """Return half of the cycle of a command [s]; 0 where it is no rhythm."""
+    cycle = cycle_s(command, step_s)
+    return cycle / 2 if np.isfinite(cycle) else 0.0
 
 
 def _usual_gain(others: Sequence[Response]) -> float:

@@ -80,3 +80,21 @@ def test_a_soft_joint_rests_off_and_is_not_accused():
     assert judgement.faults == ()
     (rest,) = judgement.rests
     assert (rest.joint, rest.offset_rad) == ("j3", pytest.approx(-np.radians(6.0), abs=0.01))
+
+
+def late_by_half_a_cycle():
+    """Joints that stand until their commands reach them, half a cycle late."""
+    found = []
+    for k in range(6):
+        phase = 2 * np.pi * 1.2 * T - 0.5 * k
+        position = np.where(T < 0.5 / 1.2, np.sin(-0.5 * k), np.sin(phase - np.pi))
+        noise = 0.001 * np.random.default_rng(k).normal(size=T.size)
+        command = Samples(T, 0.15 * np.sin(phase))
+        found.append(JointMotion(f"j{k}", command, Samples(T, 0.12 * position + noise)))
+    return found
+
+
+def test_joints_that_are_late_by_half_a_cycle_do_not_stand_at_the_beginning():
+    judgement = judge(late_by_half_a_cycle())
+    assert judgement.faults == ()
+    assert "or lag by 0.42 s" in judgement.naming

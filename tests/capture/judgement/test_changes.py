@@ -1,0 +1,47 @@
+"""Changes of one joint in signals in closed form: small ones, late ones, few joints."""
+
+import numpy as np
+import pytest
+
+from undulog.capture.judgement.judge import judge
+from undulog.capture.judgement.motion import JointMotion, Samples
+
+T = np.arange(0.0, 100.0, 0.03)
+DEGREE = np.pi / 180
+
+
+def joints(count, *, offset=0.0, gain=0.0, late_s=0.0, from_s=78.0):
+    """Return joints of a slow gait, of which the first changes at a time."""
+    rng, after, found = np.random.default_rng(1), from_s <= T, []
+    for k in range(count):
+        own = after if k == 0 else np.zeros(T.size, bool)
+        angle = 2 * np.pi * 0.27 * (T - 0.08 - late_s * own) - 0.7 * k
+        position = 0.3 * (1 + gain * own) * np.sin(angle) + offset * own
+        command = Samples(T, 0.3 * np.sin(2 * np.pi * 0.27 * T - 0.7 * k))
+        noise = 0.004 * rng.normal(size=T.size)
+        found.append(JointMotion(f"j{k}", command, Samples(T, position + noise)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("quantity", "size", "change"),
+    [
+        ("offset", DEGREE, {"offset": DEGREE}),
+        ("gain", -0.03, {"gain": -0.03}),
+        ("lag", 0.03, {"late_s": 0.03}),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_small_change_late_in_a_gait_of_few_joints_has_its_size_and_time(
+    quantity, size, change, count
+):
+    (found,) = judge(joints(count, **change)).changes
+    assert (found.joint, found.quantity) == ("j0", quantity)
+    assert abs(found.change - size) <= found.half_width < abs(size)
+    assert found.onset_s[0] - 0.1 <= 78.0 <= found.onset_s[1] + 0.1
+    assert found.until_s is None
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_joints_of_a_gait_without_a_change_have_none(count):
+    assert judge(joints(count)).changes == ()
