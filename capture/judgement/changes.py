@@ -334,11 +334,11 @@ def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray, parts:
         width = residual.size // parts
         if residual.size < 2 * FEWEST:
             continue
-        rows = residual[: parts * width].reshape(parts, width)
+        rows: FloatArray = residual[: parts * width].reshape(parts, width)
         rows = rows - rows.mean(axis=1, keepdims=True)
         correlation = np.fft.irfft(np.abs(np.fft.rfft(rows, 2 * width)) ** 2)[:, :width]
         below = correlation < correlation[:, :1] / np.e
-        steps = np.where(below.any(axis=1), below.argmax(axis=1), width)
+        steps: IntArray = np.where(below.any(axis=1), below.argmax(axis=1), width)
         times.append(float(np.median(steps)) * course.step_s)
     return float(np.median(times)) if times else 0.0
 
