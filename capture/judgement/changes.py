@@ -338,7 +338,8 @@ def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray, parts:
         rows = rows - rows.mean(axis=1, keepdims=True)
         correlation = np.fft.irfft(np.abs(np.fft.rfft(rows, 2 * width)) ** 2)[:, :width]
         below = correlation < correlation[:, :1] / np.e
-        steps: IntArray = np.where(below.any(axis=1), below.argmax(axis=1), width)
+        steps = below.argmax(axis=1).astype(np.float64)
+        steps[~below.any(axis=1)] = width
         times.append(float(np.median(steps)) * course.step_s)
     return float(np.median(times)) if times else 0.0
 
