@@ -28,6 +28,7 @@ from .levels import (
     HALF,
     LEVEL,
     NEGLIGIBLE,
+    QUARTER,
     REST_ERRORS,
     TINY,
     WIDTH,
@@ -95,10 +96,13 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
         if len(others) > 2:
             common = np.asarray(np.median(amplitude[others], axis=0), dtype=np.float64)
         least = _least_rad(frequency, course, exposure, k)
+        # What no response fits is a share of what the joint moves at that frequency.
+        moved = _moved(course, k, np.where(usable[k], exposure.fitted[k, begun:], 0.0), padded)
         sure = (tail[k] < LEVEL / tests) & (amplitude[k] > NEIGHBOURS * common)
+        sure &= amplitude[k] > QUARTER * moved
         if len(others) > 2:  # they show how much noise there is at a frequency
             beside = _beside(amplitude[k], common, len(others)) < LEVEL / tests
-            sure |= beside & (tail[k] < LEVEL)
+            sure |= beside & (tail[k] < LEVEL) & (HALF * amplitude[k] > moved)
         sure &= _free(frequency, course, k, resolved, like=len(others) > 2)
         if not sure.any():
             continue
@@ -111,6 +115,13 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
         if size_rad + WIDTH * float(error[k, best]) > COVERAGE * least[best]:
             lines.append(Line(k, float(frequency[best]), size_rad))
     return lines
+
+
+def _moved(course: Course, k: int, fitted: FloatArray, padded: int) -> FloatArray:
+    """Return the amplitude of a response at each frequency; 0 of a rhythm, which has harmonics."""
+    if np.isfinite(cycle_s(course.command[k], course.step_s)):
+        return np.zeros(padded // 2 + 1)
+    return _tested(fitted - fitted.mean(), padded, TAPERS)[0]
 
 
 def vibrates(course: Course, exposure: Exposure, k: int) -> bool:

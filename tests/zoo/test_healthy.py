@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from zoo import motions
+from zoo.adapter import stated
 from zoo.disturbances import Noise, quantised, repeated
 from zoo.healthy import DEGREE, Healthy
 from zoo.independent_fit import EXPLAINED, independent_fit
@@ -188,3 +189,11 @@ def test_the_twin_is_healthy():
     for j in robot.moved:
         fit = independent_fit(robot.t_s, signals.commands[:, j], signals.positions[:, j], (0, None))
         assert fit.explained > EXPLAINED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [8103, 8203])
+def test_edges_of_steps_between_samples_are_no_motion_of_a_joint(seed):
+    """What no response fits of them is a share of what the command moves at a frequency."""
+    said = stated(record(draw("binary", seed), seed=seed))
+    assert [one for one in said.different if one.quantity == "motion"] == []
