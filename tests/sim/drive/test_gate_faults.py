@@ -118,9 +118,12 @@ def test_a_process_that_comes_late_does_not_jump(driving):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, pytest.param(True, marks=pytest.mark.nightly)])
-def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving):
+def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving, tmp_path):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
-    with driving(plain=plain) as drive:
+    waits = dict.fromkeys(("reply_timeout_s", "max_late_s", "fault_after_s"), 60.0)
+    robot, scenario = gate_stage.robot_files(tmp_path / "waits", safety=gate_stage.SAFETY | waits)
+    session = gate_stage.commanded(tmp_path / "waits.mcap", robot, 60.0)
+    with driving(scenario=scenario, recorded=session, plain=plain) as drive:
         drive.begun()
         for _ in range(8):
             drive.signal(signal.SIGSTOP, 0.3)
