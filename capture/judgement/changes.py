@@ -9,6 +9,7 @@ change. A change is a shift of one of the four for a run of blocks, or a drift o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 
@@ -97,6 +98,7 @@ class _Blocks:
     edges_s: FloatArray
     half_s: float  # half of the longest cycle; 0 where the commands are no rhythms
     lost_rad: FloatArray  # what the response leaves in half of the blocks, three deviations
+    rhythms: tuple[bool, ...]  # whether a command repeats
     swept: tuple[bool, ...]  # whether the frequency of a command follows from the time
 
     @property
@@ -177,16 +179,17 @@ def _jump(k: int, quantity: str, run: Shift, edges_s: FloatArray) -> Jump:
 def _matters(quantity: str, k: int, exposure: Exposure, run: Shift, blocks: _Blocks) -> bool:
     """Return whether a change is one that matters: its interval isn't within the margin.
 
-    Where the motion is no rhythm, it is also beyond what a response leaves of the joint's motion,
-    and the command is no sweep: play, stick and poles beyond two make another gain of every other
-    motion.
+    Where the command is no rhythm, and no like joints have one, it is also beyond what a response
+    leaves of the joint's motion, and the command is no sweep: play, stick and poles beyond two make
+    another gain of every other motion.
     """
     compared = len(exposure.group(k)) >= ENOUGH_LIKE
     alone = not (compared and blocks.half_s)
     if quantity == "noise":  # of unlike joints it grows and falls with the motion
         margin = 2 * NOISE_MARGIN if alone else NOISE_MARGIN
         return compared and not blocks.swept[k] and _reaches(run, margin)
-    lost = 0.0 if blocks.half_s else float(blocks.lost_rad[k])
+    repeats = blocks.rhythms[k] or not alone
+    lost = 0.0 if repeats else float(blocks.lost_rad[k])
     if quantity in ("offset", "drift"):
         return _reaches(run, ANGLE_MARGIN_RAD) and abs(run.change) > lost
     inside = slice(run.first, run.last)
@@ -216,9 +219,8 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
     length_s = float(course.t_s[-1] - course.t_s[0])
     cycles = [cycle_s(command, course.step_s) / 2 for command in course.command]
     half = max((cycle for cycle in cycles if np.isfinite(cycle)), default=0.0)
-    # A change makes the residual's correlation longer; what repeats is known without it.
-    parts = FEWEST if half else 1
-    shortest = max(length_s / MOST, 2 * _correlation_s(course, exposure, usable, parts))
+    rhythms = tuple(bool(np.isfinite(cycle)) for cycle in cycles)
+    shortest = max(length_s / MOST, 2 * _correlation_s(course, exposure, usable, rhythms))
     whole = max(1.0, np.ceil(shortest / half)) * half if half else shortest
     count = min(int(length_s / whole), MOST)
     if count < FEWEST:
@@ -246,7 +248,7 @@ def _blocks(course: Course, exposure: Exposure, usable: BoolArray) -> _Blocks | 
     weights[weights < INFORMED * best] = 0
     edges = course.t_s[0] + width * course.step_s * np.arange(count + 1)
     swept = tuple(is_sweep(command) for command in course.command)
-    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, swept)
+    return _Blocks(values, weights, np.asarray(edges, dtype=np.float64), half, lost, rhythms, swept)
 
 
 def _excess_noise(left: FloatArray, weights: FloatArray, exposure: Exposure) -> FloatArray:
@@ -326,11 +328,17 @@ def _regressed(
     return estimate.T, weights, left
 
 
-def _correlation_s(course: Course, exposure: Exposure, usable: BoolArray, parts: int) -> float:
-    """Return the median time after which the residuals' correlation is below 1/e in the parts."""
+def _correlation_s(
+    course: Course, exposure: Exposure, usable: BoolArray, rhythms: Sequence[bool]
+) -> float:
+    """Return the median time after which the residuals' correlation is below 1/e.
+
+    Of a rhythm it is that within parts of the record, so that a change doesn't make it longer.
+    """
     times: list[float] = []
     for k in range(course.position.shape[0]):
         residual = (course.position[k] - exposure.fitted[k])[usable[k]]
+        parts = FEWEST if rhythms[k] else 1
         width = residual.size // parts
         if residual.size < 2 * FEWEST:
             continue
