@@ -53,9 +53,9 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
-# Four processes at once: two of tests that compute, in the time that the others leave them, which
-# have the tests of processes, time and pictures, and wait more than they compute. A file of one may
-# lie in a folder of another: all four shall end at about the same time.
+# Four processes at once: two of tests that compute, and two of those of processes, time and pictures,
+# which wait more than they compute. A file of one may lie in a folder of another: all four shall end
+# at about the same time. None has a lower priority: beside other programs it would hardly run.
 ANALYSIS = $(addprefix tests/replay/sweep/,test_cluster.py test_object_store.py test_standing.py) \
   tests/analysis tests/capture/sources tests/docs
 COMPUTING = tests/house tests/zoo/test_error_control.py tests/zoo/test_zoo.py tests/replay/sweep \
@@ -70,9 +70,9 @@ part = $(addprefix --ignore=,$(filter $(addsuffix /%,$(1)),$(ANALYSIS) $(COMPUTI
 # JUnit files, with the seconds of each test, lie in out/tests/.
 define tests
 	@mkdir -p out/tests; logs=$$(mktemp -d); \
-	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-analysis.xml \
+	$(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-analysis.xml \
 	  $(call part,$(ANALYSIS)) >$$logs/1 2>&1 & first=$$!; \
-	nice -n 5 $(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-computing.xml \
+	$(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-computing.xml \
 	  $(call part,$(COMPUTING)) >$$logs/2 2>&1 & second=$$!; \
 	$(PYTEST) -p no:cacheprovider -m $(2) --junitxml out/tests/$(1)-waiting.xml \
 	  $(call part,$(WAITING)) >$$logs/3 2>&1 & third=$$!; \

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from .levels import ANGLE_MARGIN_RAD, COVERAGE, FULL, MISSING, WHOLE
+from .levels import ANGLE_MARGIN_RAD, COVERAGE, FEWEST, FULL, MISSING, WHOLE
 from .shifts import rank_correlation
 
 LARGEST_COURSE = 1 << 16
@@ -200,8 +200,11 @@ def cycle_s(command: FloatArray, step_s: float) -> float:
 
 
 def is_sweep(command: FloatArray) -> bool:
-    """Return whether the cycles of a command of shape (n,) get shorter, or longer, all along."""
+    """Return whether the cycles of a command of shape (n,) get shorter, or longer, all along.
+
+    Fewer than :data:`FEWEST` do so by chance.
+    """
     lengths = np.diff(rises_of(command))
-    if lengths.size <= 2 or lengths.min() == lengths.max():
+    if lengths.size < FEWEST or lengths.min() == lengths.max():
         return False
     return abs(rank_correlation(lengths)) > FULL
