@@ -23,8 +23,8 @@ from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
-from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
+from ..segments.words import deviation_in_words, fault_in_words
 from ..session.runs import GaitRun, command_difference, other_frequency
 from ..signals.stretch import Options
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from undulog.capture.judgement.naming import NAMED
+
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.answer import Answer, NotFollowing
@@ -23,7 +25,7 @@ from ..results.coupling import (
 )
 from ..results.estimate import Estimate, leaves_out_zero
 from ..results.experiment import OrderedPair, Reversal
-from ..segments.answer import NAMED, fault_in_words
+from ..segments.words import fault_in_words
 from ..session.runs import Role
 from .pooling import PooledResponse
 from .reversal import SIGNIFICANT

@@ -30,10 +30,12 @@ from .levels import (
 from .motion import Course
 from .shifts import (
     Shift,
+    common_noise,
     correlation_of,
     drift_of,
     largest_shift,
     limited_weights,
+    noise_of,
     without_single,
 )
 
@@ -100,9 +102,13 @@ def _jumps(blocks: Blocks, exposure: Exposure) -> list[tuple[float, Jump]]:
         weights = limited_weights(without_single(values, weights))
         rho = correlation_of(values, weights)
         tests = weights.shape[0] * len(QUANTITIES)
+        noises = [noise_of(*row, rho) for row in zip(values, weights, strict=True)]
         for k, (value, weight) in enumerate(zip(values, weights, strict=True)):
             compared = len(exposure.group(k)) >= ENOUGH_LIKE
-            shift = largest_shift(value, weight, rho, tests, blocks.shortest, compared=compared)
+            like = common_noise([noises[j] for j in exposure.group(k) if j != k])
+            shift = largest_shift(
+                value, weight, rho, tests, blocks.shortest, compared=compared, like=like
+            )
             offer(k, quantity, shift)
             if quantity == "offset":
                 offer(k, "drift", drift_of(value, weight, rho, tests))

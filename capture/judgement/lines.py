@@ -66,11 +66,24 @@ class Line:
 def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Line]:
     """Find the largest line of each joint that like joints don't have.
 
+    In the whole record, and else in either half: what comes or goes is no line of the whole.
+
     Args:
         usable: Steps that are looked at, shape (k, n); elsewhere the residual counts as zero.
     """
     begun = int(np.median(np.argmax(usable, axis=1)))
-    usable = usable[:, begun:]
+    end = usable.shape[1]
+    middle = (begun + end) // 2
+    found: dict[int, Line] = {}
+    for first, last in ((begun, end), (begun, middle), (middle, end)):
+        for line in _lines(course, exposure, usable, slice(first, last)):
+            found.setdefault(line.joint, line)
+    return [found[k] for k in sorted(found)]
+
+
+def _lines(course: Course, exposure: Exposure, usable: BoolArray, part: slice) -> list[Line]:
+    """Return the largest line of each joint in a part of the record."""
+    usable = usable[:, part]
     count, size = usable.shape
     # Between the frequencies of the record a line would lose up to a third of its amplitude.
     padded = 2 << size.bit_length()
@@ -79,7 +92,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     slow = frequency <= (TAPERS + 1) / (size * course.step_s)
     tapers = np.where(slow, few, TAPERS)
     resolved = (tapers + 1) / (2 * size * course.step_s)
-    residual = np.where(usable, (course.position - exposure.fitted)[:, begun:], 0.0)
+    residual = np.where(usable, (course.position - exposure.fitted)[:, part], 0.0)
     residual -= np.mean(residual, axis=1, keepdims=True)
     amplitude, error, tail = np.empty((1 + 2, count, frequency.size))
     for k in range(count):
@@ -88,7 +101,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
             found = _tested(residual[k], padded, few)
             for values, other in zip((amplitude, error, tail), found, strict=True):
                 values[k, slow] = other[slow]
-    tests = count * size
+    tests = 2 * count * course.t_s.size  # of the whole record and of its halves
     lines: list[Line] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
@@ -97,7 +110,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
             common = np.asarray(np.median(amplitude[others], axis=0), dtype=np.float64)
         least = _least_rad(frequency, course, exposure, k)
         # What no response fits is a share of what the joint moves at that frequency.
-        moved = _moved(course, k, np.where(usable[k], exposure.fitted[k, begun:], 0.0), padded)
+        moved = _moved(course, k, np.where(usable[k], exposure.fitted[k, part], 0.0), padded)
         sure = (tail[k] < LEVEL / tests) & (amplitude[k] > NEIGHBOURS * common)
         sure &= amplitude[k] > QUARTER * moved
         if len(others) > 2:  # they show how much noise there is at a frequency

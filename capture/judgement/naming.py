@@ -1,19 +1,7 @@
 """Do the names of the joints fit, or does a permutation of them explain the positions better?
 
-Joint i follows the command of joint j by a delay d and a gain g that all joints share,
-
-    p_i(t) = b_i + g c_j(t - d) + e_i(t),
-
-and the share of its variance that this explains is
-
-    E_ij(d) = 1 - |p_i - g c_j(. - d)|^2 / |p_i|^2 = 1 - (P_i - 2 g X_ij(d) + g^2 C_j) / P_i,
-
-with the powers P and C of positions and commands about their means and their cross power X; below 0
-it counts as 0. One gain for all keeps what amplitudes tell. It is the median ratio of the sorted
-amplitudes, which no permutation changes and a few faulty joints hardly. For each delay the best
-permutation is a linear assignment (Crouse, IEEE Trans. Aerosp. Electron. Syst. 52, 2016, doi
-10.1109/TAES.2016.140952, in SciPy). Delays go up to half a period of the commands, as a servo of
-two poles lags by 180 degrees at most, or to the longest dead time of a bus.
+For each delay of :mod:`.pairs` the best permutation is a linear assignment (Crouse, IEEE Trans.
+Aerosp. Electron. Syst. 52, 2016, doi 10.1109/TAES.2016.140952, in SciPy).
 
 What one uniform gait can't tell. With c_j(t) = A sin(w t - j psi) the command of joint j + 1 is
 that of joint j, later by psi / w: names that are shifted by one joint, and a lag of psi for all,
@@ -31,37 +19,19 @@ from enum import StrEnum
 from itertools import combinations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment
 
-from ..common.arrays import BoolArray, FloatArray, IntArray
-from ..common.errors import DataError, some_names
+from ..common.arrays import FloatArray
+from ..common.errors import some_names
 from .levels import (
     ENOUGH_LIKE,
     FOLLOWS,
     GAIN_MARGIN,
     HALF,
-    NEGLIGIBLE,
     QUARTER,
     WHOLE,
 )
-from .response import LATEST_S
-
-MOVES = NEGLIGIBLE
-"""A joint whose standard deviation is below this share of the largest stands still: the share by
-which the analysis tells driven joints (``DRIVEN_SHARE``)."""
-
-PER_PERIOD = 16
-"""Samples a period that are looked at, at least; finer records are thinned out. Any number above
-the two of the sampling theorem will do: 16 leave room for what is faster than the median."""
-
-DELAYS = 2 * PER_PERIOD + 1
-"""Delays that are tried in half a period: 5.6 degrees of phase apart, so that the nearest
-is within 2.8 degrees, which costs sin^2 = 0.24 % of the explained share."""
-
-LEAST_PERIODS = 2.0
-"""Periods that a record must have: over less than two, any two smooth motions are alike."""
-
+from .pairs import Pairs, explained_pairs, moving
 
 DECIDES = 1 - FOLLOWS
 """Loss of explained share by which one joint decides between two explanations: that from all of it
@@ -162,8 +132,7 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
     Raises:
         DataError: If the shapes differ, a value isn't finite, or the interval isn't positive.
     """
-    _check(commands, positions, step_s)
-    pairs = _explained_pairs(commands, positions, step_s)
+    pairs = explained_pairs(commands, positions, step_s)
     if pairs is None:
         return Naming(Verdict.UNKNOWN)
     alike = _interchangeable(commands)
@@ -187,7 +156,7 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
 
 
 def _permuted(
-    pairs: _Pairs, named: Explanation, best: Explanation, alike: tuple[tuple[int, ...], ...]
+    pairs: Pairs, named: Explanation, best: Explanation, alike: tuple[tuple[int, ...], ...]
 ) -> Naming:
     """Weigh the best permutation against the names as they are."""
     loss = best.explained - named.explained
@@ -228,7 +197,7 @@ def _fits_in(one: Explanation, joint: int) -> bool:
     return float(np.median(one.explained) - one.explained[joint]) <= 2 * AS_GOOD
 
 
-def _simplest(pairs: _Pairs, named: Explanation, others: Sequence[Explanation]) -> Explanation:
+def _simplest(pairs: Pairs, named: Explanation, others: Sequence[Explanation]) -> Explanation:
     """Return the simplest explanation that is as good as the best one.
 
     The names as they are come first, then two joints swapped, a shift or the reversal of all, then
@@ -283,101 +252,7 @@ def _as_good(one: Explanation, best: Explanation) -> bool:
     return not _deciding(best, one) and float(loss[differs].sum()) <= AS_GOOD * differs.sum()
 
 
-@dataclass(frozen=True)
-class _Pairs:
-    """What each command explains of each joint.
-
-    Attributes:
-        delay_s: Delays [s], shape (k,).
-        explained: By delay, joint and command, shape (k, m, m).
-        opposite: The same with the opposite gain.
-        judged: Joints that move, or are commanded to, shape (m,).
-    """
-
-    delay_s: FloatArray
-    explained: FloatArray
-    opposite: FloatArray
-    judged: BoolArray
-
-
-def _check(commands: FloatArray, positions: FloatArray, step_s: float) -> None:
-    if commands.ndim != 2 or commands.shape != positions.shape:
-        raise DataError(
-            f"commands of shape {commands.shape} and positions of shape {positions.shape}: both "
-            "take samples times joints"
-        )
-    if not (np.isfinite(commands).all() and np.isfinite(positions).all()):
-        raise DataError("commands and positions must be finite")
-    if not 0 < step_s < np.inf:
-        raise DataError(f"a sampling interval of {step_s:g} s is none")
-
-
-def _explained_pairs(commands: FloatArray, positions: FloatArray, step_s: float) -> _Pairs | None:
-    """Return what each command explains of each joint; None where too little moves."""
-    count, joints = commands.shape
-    if joints < 2 or count < 2 * LEAST_PERIODS * PER_PERIOD:
-        return None
-    asked, given = _moving(commands), _moving(positions)
-    period_s = _median_period_s(commands, step_s)
-    if np.count_nonzero(asked) < 2 or not given.any():
-        return None
-    if not 2 * step_s < period_s <= count * step_s / LEAST_PERIODS:
-        return None
-    longest_s = max(period_s / 2, min(period_s, LATEST_S))
-    tried = int(np.ceil(DELAYS * longest_s / (period_s / 2)))
-    delay_s = np.linspace(0.0, longest_s, tried)
-    skipped = int(np.ceil(delay_s[-1] / step_s))
-    stride = max(1, int(period_s / (PER_PERIOD * step_s)))
-    rows: IntArray = np.arange(skipped, count, stride, dtype=np.int64)
-    time_s: FloatArray = step_s * np.arange(float(count))
-    curve = CubicSpline(time_s, commands)
-    given_values = positions[rows] - positions[rows].mean(axis=0)
-    power = np.sum(given_values**2, axis=0)
-    gain = _common_gain(commands[:, asked], positions[:, given])
-    explained = np.empty((delay_s.size, joints, joints))
-    opposite = np.empty_like(explained)
-    for k, delay in enumerate(delay_s):
-        late = curve(time_s[rows] - delay)
-        late -= late.mean(axis=0)
-        both = gain * (given_values.T @ late)
-        left = power[:, None] + gain**2 * np.sum(late**2, axis=0)
-        explained[k] = _share(left - 2 * both, power)
-        opposite[k] = _share(left + 2 * both, power)
-    for table in (explained, opposite):
-        table[:, ~given[:, None] | ~asked] = 0.0
-        table[:, ~given[:, None] & ~asked] = 1.0
-    return _Pairs(delay_s, explained, opposite, asked | given)
-
-
-def _share(left: FloatArray, power: FloatArray) -> FloatArray:
-    """Explained share of each row, at least 0."""
-    whole = np.maximum(power, np.finfo(float).tiny)[:, None]
-    return 1 - np.minimum(left, whole) / whole
-
-
-def _moving(values: FloatArray) -> BoolArray:
-    size = values.std(axis=0)
-    return size > max(MOVES * float(size.max(initial=0.0)), np.finfo(float).eps)
-
-
-def _common_gain(commands: FloatArray, positions: FloatArray) -> float:
-    """Return the median ratio of the sorted amplitudes of what is asked and what is given."""
-    asked, given = np.sort(commands.std(axis=0)), np.sort(positions.std(axis=0))
-    few = min(asked.size, given.size)  # the largest ones of both
-    return float(np.median(given[-few:] / asked[-few:]))
-
-
-def _median_period_s(commands: FloatArray, step_s: float) -> float:
-    """Return one over the frequency below which half of the commands' power is [s]."""
-    count = len(commands)
-    taper: FloatArray = np.hanning(count)[:, None]
-    centred: FloatArray = commands - commands.mean(axis=0)
-    power: FloatArray = np.sum(np.abs(np.fft.rfft(taper * centred, axis=0)) ** 2, axis=1)
-    half = int(np.count_nonzero(np.cumsum(power) < power.sum() / 2))
-    return count * step_s / max(half, 1)
-
-
-def _candidates(pairs: _Pairs) -> list[Explanation]:
+def _candidates(pairs: Pairs) -> list[Explanation]:
     """Return the names as they are, then the best order of each delay, each at its best delay."""
     count = pairs.judged.size
     favoured = pairs.explained + AS_GOOD * np.eye(count)
@@ -388,7 +263,7 @@ def _candidates(pairs: _Pairs) -> list[Explanation]:
     return [_explanation(pairs, order) for order in orders]
 
 
-def _shifts(pairs: _Pairs) -> list[Explanation]:
+def _shifts(pairs: Pairs) -> list[Explanation]:
     """Return the orders that a chain may be read in: shifted along it, nearest first; reversed."""
     joints = list(range(pairs.judged.size))
     steps = sorted(joints[1:], key=lambda step: min(step, len(joints) - step))
@@ -396,14 +271,14 @@ def _shifts(pairs: _Pairs) -> list[Explanation]:
     return [_explanation(pairs, order) for order in (*orders, joints[::-1])]
 
 
-def _swapped(pairs: _Pairs, names: Sequence[int], first: int, second: int) -> Explanation:
+def _swapped(pairs: Pairs, names: Sequence[int], first: int, second: int) -> Explanation:
     """Return the names with two joints swapped."""
     order = list(names)
     order[first], order[second] = order[second], order[first]
     return _explanation(pairs, order)
 
 
-def _explanation(pairs: _Pairs, order: Sequence[int]) -> Explanation:
+def _explanation(pairs: Pairs, order: Sequence[int]) -> Explanation:
     """Return an order of the joints at the delay at which it explains most."""
     joints = list(range(pairs.judged.size))
     shares: FloatArray = pairs.explained[:, joints, list(order)]
@@ -412,7 +287,7 @@ def _explanation(pairs: _Pairs, order: Sequence[int]) -> Explanation:
     return Explanation(kind, tuple(order), float(pairs.delay_s[best]), shares[best])
 
 
-def _inverted(pairs: _Pairs, named: Explanation, which: Iterable[int]) -> Explanation:
+def _inverted(pairs: Pairs, named: Explanation, which: Iterable[int]) -> Explanation:
     """Return the names as they are, with some joints inverted."""
     joints, turned = list(named.permutation), list(which)
     shares: FloatArray = pairs.explained[:, joints, joints]
@@ -425,10 +300,10 @@ def _interchangeable(commands: FloatArray) -> tuple[tuple[int, ...], ...]:
     """Return the sets of joints whose commands are alike within :data:`AS_GOOD`, by the first."""
     centred = commands - commands.mean(axis=0)
     power = np.sum(centred**2, axis=0)
-    moving = _moving(commands)
+    moves = moving(commands)
     sets: list[tuple[int, ...]] = []
-    free = moving.copy()
-    for k in np.flatnonzero(moving).tolist():
+    free = moves.copy()
+    for k in np.flatnonzero(moves).tolist():
         if not free[k]:
             continue
         apart = np.sum((centred - centred[:, k : k + 1]) ** 2, axis=0)

@@ -8,19 +8,22 @@ with x_i = 1 in one run of blocks and 0 elsewhere, or rising evenly from 0 to 1,
 autoregression of the correlation rho from block to block, of which the median over the joints is
 taken, its bias of -(1 + 4 rho)/b put back (Marriott & Pope, Biometrika 41, 1954, doi
 10.1093/biomet/41.3-4.390). Generalised least squares gives c and its error (Prais & Winsten, Cowles
-Commission 383, 1954); c over its error has Student's distribution. Level: half for the lasting
-changes, of which there are about b a series, half for the passing ones, b^2/2 (Bonferroni).
+Commission 383, 1954); c over its error has Student's distribution. Like joints have a similar
+noise: as far as their s^2 agree, s^2 is taken from theirs besides, with more degrees of freedom
+(Smyth, Stat. Appl. Genet. Mol. Biol. 3, 2004, doi 10.2202/1544-6115.1027). Level: half for the
+lasting changes, of which there are about b a series, half for the passing ones, b^2/2 (Bonferroni).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import chdtri, digamma, polygamma, stdtrit
 
 from ..common.arrays import FloatArray, IntArray
-from .levels import COVERAGE, FEWEST, LEVEL, ROBUST, TAME, TINY
+from .levels import COVERAGE, ENOUGH_LIKE, FEWEST, FULL, LEVEL, ROBUST, TAME, TINY
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,56 @@ class Shift:
     first: int
     last: int
     drop: float
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of equation (1).
+
+    Attributes:
+        variance: (1 - rho^2) s^2, of what is new from block to block.
+        freedom: Degrees of freedom that it is known with.
+    """
+
+    variance: float
+    freedom: float
+
+
+UNKNOWN = Noise(0.0, 0.0)
+"""Of joints that have no like ones."""
+
+
+def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> Noise:
+    """Return the noise of one series of shape (b,) if nothing changed in it."""
+    known = weights > 0
+    freedom = int(known.sum()) - 1
+    if freedom < 1:
+        return UNKNOWN
+    scale = np.sqrt(weights[known])
+    whole, target = _whitened(scale, rho), _whitened(scale * values[known], rho)
+    left = float(target @ target) - float(whole @ target) ** 2 / float(whole @ whole)
+    return Noise(max(left, TINY) / freedom, freedom)
+
+
+def common_noise(noises: Sequence[Noise]) -> Noise:
+    """Return what the noise of several like joints tells of that of one more (Smyth, section 6.2).
+
+    The joints' own scatter is taken at its upper limit of 90 %; that of few joints tells little.
+    """
+    known = [noise for noise in noises if noise.freedom > 0]
+    if len(known) < ENOUGH_LIKE - 1:
+        return UNKNOWN
+    half = np.array([noise.freedom for noise in known]) / 2
+    logs = np.log([noise.variance for noise in known]) - digamma(half) + np.log(half)
+    middle = float(np.median(logs))
+    # The median distance isn't that of a joint which changed.
+    scatter = (ROBUST * float(np.median(np.abs(logs - middle)))) ** 2
+    most = scatter * (len(known) - 1) / float(chdtri(len(known) - 1, FULL))
+    excess = most - float(np.mean(polygamma(1, half)))
+    pooled = 2 * float(half.sum())
+    # trigamma(x) is above 1/x + 1/(2 x^2).
+    freedom = pooled if excess <= 0 else min(pooled, (1 + np.sqrt(1 + 2 * excess)) / excess)
+    return Noise(float(np.exp(middle + digamma(freedom / 2) - np.log(freedom / 2))), freedom)
 
 
 def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
@@ -104,10 +157,12 @@ def largest_shift(
     shortest: int,
     *,
     compared: bool,
+    like: Noise = UNKNOWN,
 ) -> Shift | None:
     """Return the most certain run of blocks, or None if none is beyond the level.
 
     Args:
+        like: What the noise of like joints tells of its.
         compared: Whether like joints have taken off what a model leaves: then what is left is
             chance, and the plain difference of means must be beyond it, too.
     """
@@ -121,10 +176,10 @@ def largest_shift(
         first, last = _runs(known, values.size, shortest, lasting=lasting)
         if not first.size:
             continue
-        change, outside, error = _fitted(v, w, first, last, rho)
+        change, outside, error = _fitted(v, w, first, last, rho, like=like)
         if compared:
-            error = np.maximum(error, _plain_error(v, w, first, last, rho))
-        freedom = known.size - 2 - 1  # two means, and where the run is
+            error = np.maximum(error, _plain_error(v, w, first, last, rho, like=like))
+        freedom = known.size - 2 - 1 + like.freedom  # two means, and where the run is
         limit = -float(stdtrit(freedom, LEVEL / 2 / 2 / tests / first.size))
         t = np.abs(change) / error
         k = int(np.argmax(t))
@@ -218,7 +273,13 @@ def _runs(
 
 
 def _fitted(
-    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
+    v: FloatArray,
+    w: FloatArray,
+    first: IntArray,
+    last: IntArray,
+    rho: float,
+    *,
+    like: Noise = UNKNOWN,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return c and m of equation (1), and the standard error of c, of runs."""
     scale = np.sqrt(w)
@@ -237,19 +298,27 @@ def _fitted(
     free = np.maximum(power - along**2 / level, TINY)
     change = (moment - along * total / level) / free
     left = float(target @ target) - total**2 / level - change**2 * free
-    variance = np.maximum(left, TINY) / max(v.size - 2 - 1, 1) / free
+    left = np.maximum(left, TINY) + like.freedom * like.variance
+    variance = left / (max(v.size - 2 - 1, 1) + like.freedom) / free
     return change, (total - change * along) / level, np.sqrt(variance)
 
 
 def _plain_error(
-    v: FloatArray, w: FloatArray, first: IntArray, last: IntArray, rho: float
+    v: FloatArray,
+    w: FloatArray,
+    first: IntArray,
+    last: IntArray,
+    rho: float,
+    *,
+    like: Noise = UNKNOWN,
 ) -> FloatArray:
     """Return the standard error of the difference of means in and out of runs."""
     sums = np.pad(np.cumsum([w, w * v, w * v**2], axis=1), ((0, 0), (1, 0)))
     inside = sums[:, last] - sums[:, first]
     (wi, vi, si), (wo, vo, so) = inside, sums[:, -1:] - inside
     squares = np.maximum(si - vi**2 / wi, 0) + np.maximum(so - vo**2 / wo, 0)
-    freedom = max(v.size - 2, 1) * (1 - rho) / (1 + rho)
+    squares += like.freedom * like.variance / (1 - rho**2)
+    freedom = (max(v.size - 2, 1) + like.freedom) * (1 - rho) / (1 + rho)
     return np.sqrt(np.maximum(squares / freedom * (1 / wi + 1 / wo), TINY))
 
 

@@ -18,7 +18,8 @@ from mcap.records import Channel, Schema
 
 from ..common.arrays import NS
 from ..common.errors import DataError
-from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT, WAITS_FOR_COMMANDS
+from ..log.health.findings import WAITS_FOR_COMMANDS
+from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
 from ..log.health.tallies import BusHealth, JointHealth, Timing
 from ..log.mcap.batch import MessageBatch, MessageFields

@@ -24,7 +24,8 @@ from rich.text import Text
 from ..common.amounts import format_size
 from ..common.arrays import NS
 from ..common.console import Cells, Column, cut, fit, plain, table
-from ..log.health.rules import WAITS_FOR_COMMANDS, has_rhythm
+from ..log.health.findings import WAITS_FOR_COMMANDS
+from ..log.health.rules import has_rhythm
 from ..log.messages.definitions import ERROR, OK
 from .status import (
     EventLine,

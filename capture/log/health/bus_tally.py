@@ -21,7 +21,8 @@ from ...robot.model import Robot
 from ..messages.cdr import layout_of
 from ..messages.definitions import NO_VALUES, DiagnosticStatus, MessageType
 from ..messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray, holds_fd
-from .rules import BAD_LOSS, GOOD_LOSS, Finding
+from .findings import Finding
+from .rules import BAD_LOSS, GOOD_LOSS
 from .tallies import BusHealth, TimingTally
 
 LEAST_DECODED = 0.1

@@ -31,8 +31,8 @@ from ..read.joint_messages import joint_source
 from ..read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
+from .findings import Finding
 from .rules import (
-    Finding,
     judge_differences,
     judge_file,
     judge_following,

@@ -21,11 +21,9 @@ from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
 from .bus_tally import SourceHealth, judge_source, measure_sources, named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
+from .findings import WAITING, Finding, joined
 from .freeze import FreezeTally
 from .rules import (
-    WAITING,
-    Finding,
-    joined,
     judge_body,
     judge_bus,
     judge_channel,

@@ -5,8 +5,9 @@ import dataclasses
 import pytest
 
 from undulog.analysis.results.answer import Artefact, NotFollowing, Shape, StandOut, Verdict
-from undulog.analysis.segments.answer import Facts, compose, kinds_in_words
+from undulog.analysis.segments.answer import Facts, compose
 from undulog.analysis.segments.examine import Findings
+from undulog.analysis.segments.words import kinds_in_words
 
 YAW = tuple(f"joint{k:02d}" for k in range(1, 26, 2))
 

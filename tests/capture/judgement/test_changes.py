@@ -45,3 +45,23 @@ def test_a_small_change_late_in_a_gait_of_few_joints_has_its_size_and_time(
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_joints_of_a_gait_without_a_change_have_none(count):
     assert judge(joints(count)).changes == ()
+
+
+@pytest.mark.parametrize("half", ["first", "second"])
+def test_a_vibration_of_one_half_of_ordinary_work_is_a_line(half):
+    """A line that comes or goes is beside its own noise: of the whole record no test finds it."""
+    found = joints(3)
+    rng = np.random.default_rng(9)
+    work = []
+    for k, each in enumerate(found):
+        places = np.repeat(rng.uniform(-0.6, 0.6, 34), 100)[: T.size]
+        command = np.convolve(places, np.ones(40) / 40, mode="same")
+        position = np.interp(T - 0.1, T, command) + 0.002 * rng.normal(size=T.size)
+        if k == 1:
+            shakes = T < 50 if half == "first" else T >= 50
+            position += 0.05 * np.sin(2 * np.pi * 7.3 * T) * shakes
+        work.append(JointMotion(each.name, Samples(T, command), Samples(T, position)))
+    (line,) = judge(work).extra
+    assert line.joint == "j1"
+    assert line.frequency_hz == pytest.approx(7.3, abs=0.05)
+    assert line.amplitude_rad == pytest.approx(0.05, rel=0.1)

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from undulog.capture.judgement.shifts import (
+    Noise,
     _fitted,
     _runs,
+    common_noise,
     correlation_of,
     drift_of,
     largest_shift,
     limited_weights,
+    noise_of,
     without_single,
 )
 
@@ -48,11 +51,13 @@ def found(values, weights):
     weights = limited_weights(without_single(values, weights))
     rho = correlation_of(values, weights)
     tests = 4 * len(values)
-    pairs = zip(values, weights, strict=True)
-    return [
-        (largest_shift(v, w, rho, tests, 3, compared=True), drift_of(v, w, rho, tests))
-        for v, w in pairs
-    ]
+    noises = [noise_of(v, w, rho) for v, w in zip(values, weights, strict=True)]
+    pairs = []
+    for k, (v, w) in enumerate(zip(values, weights, strict=True)):
+        like = common_noise(noises[:k] + noises[k + 1 :])
+        shift = largest_shift(v, w, rho, tests, 3, compared=True, like=like)
+        pairs.append((shift, drift_of(v, w, rho, tests)))
+    return pairs
 
 
 @pytest.mark.parametrize("rho", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
@@ -63,6 +68,63 @@ def test_chance_alone_hardly_ever_makes_a_change(rho):
         values = drawn(rng, rho)
         wrong += any(any(pair) for pair in found(values, np.ones_like(values)))
     assert wrong <= 8  # 1 % of a quarter of the quantities; 99 % limit of 150 sessions at 2 %
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.5])
+def test_chance_alone_makes_no_change_of_joints_of_which_each_has_a_noise_of_its_own(scatter):
+    """Of few blocks: standard deviations of like joints scatter by a factor of exp(0.5)."""
+    rng = np.random.default_rng(11)
+    wrong = 0
+    for _ in range(150):
+        values = drawn(rng, 0.3, joints=6, blocks=14)
+        values *= np.exp(scatter * rng.normal(size=(6, 1)))
+        wrong += any(shift for shift, _ in found(values, np.ones_like(values)))
+    assert wrong <= 5  # 0.5 % of a quarter of the quantities; 99 % limit of 150 sessions at 1 %
+
+
+def test_the_noise_of_a_series_is_that_of_its_inverse_covariance():
+    rng = np.random.default_rng(2)
+    n, rho = 15, 0.6
+    values, weights = rng.normal(size=n), rng.uniform(0.5, 2, n)
+    every = np.arange(n)
+    covariance = rho ** np.abs(every[:, None] - every) / np.sqrt(np.outer(weights, weights))
+    inverse = np.linalg.inv(covariance)
+    left = values - inverse.sum(axis=0) @ values / inverse.sum()
+    expected = (1 - rho**2) * left @ inverse @ left / (n - 1)
+    # Blocks without weight are none.
+    values, weights = np.append(values, 100.0), np.append(weights, 0.0)
+    assert noise_of(values, weights, rho) == Noise(pytest.approx(expected), n - 1)
+
+
+@pytest.mark.parametrize("freedom", [4, 12])
+def test_the_noise_of_like_joints_is_known_as_well_as_they_agree(freedom):
+    """Variances 3 d0 / chi2(d0) of 400 joints, each known with ten degrees of freedom."""
+    rng = np.random.default_rng(5)
+    variance = 3 * freedom / rng.chisquare(freedom, 400)
+    like = common_noise([Noise(v * rng.chisquare(10) / 10, 10) for v in variance])
+    assert 0.5 * freedom < like.freedom < 2 * freedom
+    assert like.variance == pytest.approx(3, rel=0.15)
+
+
+def test_joints_of_one_noise_are_one():
+    rng = np.random.default_rng(6)
+    like = common_noise([Noise(2 * rng.chisquare(10) / 10, 10) for _ in range(400)])
+    assert like.freedom > 60
+    assert like.variance == pytest.approx(2, rel=0.05)
+
+
+def test_too_few_joints_tell_nothing_of_the_noise_of_another():
+    assert common_noise([Noise(1.0, 10)] * 2) == Noise(0.0, 0.0)
+
+
+def test_a_step_among_like_joints_is_found_in_few_blocks():
+    """Alone it is within the limit of Student's distribution of eleven degrees of freedom."""
+    values = drawn(np.random.default_rng(8), 0.0, joints=30, blocks=14)
+    values[2, 8:] += 5.0
+    weights = np.ones_like(values)
+    assert [k for k, (shift, _) in enumerate(found(values, weights)) if shift] == [2]
+    alone = largest_shift(values[2], weights[2], 0.0, 4 * 30, 3, compared=True)
+    assert alone is None
 
 
 def test_a_step_of_many_deviations_is_found_where_it_is():

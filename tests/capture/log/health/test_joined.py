@@ -7,7 +7,7 @@ import pytest
 from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
-from undulog.capture.log.health.rules import Fault, joined, listed
+from undulog.capture.log.health.findings import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
 
 JOINT_STATE = "sensor_msgs/msg/JointState"

@@ -1,0 +1,102 @@
+"""Clauses of the answer: one fault, one difference, one size, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from undulog.capture.common.console import plain
+from undulog.capture.judgement.fault import RestsOff, clause_of
+from undulog.capture.judgement.naming import NAMED
+
+from ..results import formats
+from ..results.answer import NotFollowing, StandOut
+from ..results.estimate import Estimate, Interval
+
+_KIND_WORDS = {
+    "at_limit": "at a limit",
+    "swapped": "swapped with another joint",
+    "frozen_sensor": "a frozen sensor",
+    "inverted_sensor": "an inverted sensor",
+    "stale_sensor": "a sensor with old values",
+    "scaled_sensor": "a sensor of wrong scale or unit",
+    "slipped_sensor": "a sensor whose zero moved",
+    "noisy_sensor": "a noisy sensor",
+    "wrapped_sensor": "a sensor that wrapped around",
+    "drifting_sensor": "a drifting sensor",
+    "clipped_sensor": "a clipped sensor",
+}
+"""Kinds of fault that their own name does not describe."""
+
+
+def kinds_in_words(kinds: Sequence[str]) -> str:
+    """Kinds of fault that fit, as a reader takes them.
+
+    Args:
+        kinds: Keys of :data:`.capture.judgement.fault.KINDS`.
+
+    Returns:
+        For example ``jammed, dead or a frozen sensor``.
+    """
+    words = [_KIND_WORDS.get(kind, kind.replace("_", " ")) for kind in kinds]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def fault_in_words(fault: NotFollowing) -> str:
+    """One joint that does not follow, as a clause.
+
+    Returns:
+        For example ``joint04 does not follow its command from 7.4 s on: jammed or dead``.
+    """
+    if fault.kinds == ("lost_samples",):
+        return f"{plain(fault.joint)} {fault.evidence}"
+    match fault.since_s, fault.until_s:
+        case None, None:
+            when = ""
+        case since, None:
+            when = f" from {since:.1f} s on"
+        case None, until:
+            when = f" until {until:.1f} s"
+        case since, until:
+            share = max(1.0, 100 * fault.share)
+            when = f" for {share:.0f} % of the time from {since:.1f} to {until:.1f} s"
+    return f"{plain(fault.joint)} does not follow its command{when}: {kinds_in_words(fault.kinds)}"
+
+
+def rests_in_words(rests: Sequence[RestsOff]) -> str:
+    """Joints that rest off their commands, as one clause.
+
+    Returns:
+        For example ``Pitch, Elbow rest 4.3 and 4.6 degrees off their commands``.
+    """
+    if len(rests) == 1:
+        return clause_of(rests[0], plain(rests[0].joint))
+    sizes = [f"{abs(math.degrees(each.offset_rad)):.2g}" for each in rests]
+    if len(rests) > NAMED:
+        most = max(sizes, key=float)
+        return f"{len(rests)} joints rest off their commands, up to {most} degrees"
+    names = ", ".join(plain(each.joint) for each in rests)
+    verb = "rest" if any(each.rests for each in rests) else "are"
+    return f"{names} {verb} {', '.join(sizes[:-1])} and {sizes[-1]} degrees off their commands"
+
+
+def deviation_in_words(each: StandOut) -> str:
+    """One deviation with its interval; the word carries the sign.
+
+    Returns:
+        For example ``gain 20.1 % [18.9, 21.2] less``.
+    """
+    negative, text = each.deviation < 0, size_in_words(each.quantity, each.deviation, each.ci95)
+    if each.quantity == "offset":
+        return f"its mean {text} {'below' if negative else 'above'} its command's"
+    return f"{each.quantity} {text} {'less' if negative else 'more'}"
+
+
+def size_in_words(quantity: str, value: float, ci95: Interval) -> str:
+    """Return the magnitude of a difference with its interval, in percent or degrees."""
+    sign = -1.0 if value < 0 else 1.0
+    low, high = sorted(sign * end for end in ci95)
+    size = Estimate(sign * value, (low, high))
+    if quantity == "gain":
+        return formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+    return formats.estimate(formats.degrees(size), "°", most=2)
