@@ -31,9 +31,10 @@ from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.source_clock import SourceClock
 from undulog.capture.sources.reader_thread import ReceiveThread
 
-# One frame a packet, never waiting; at each line of stdin so many, with 0.1 ms between.
+# One frame a packet; at each line of stdin so many, with 0.1 ms between. A frame for which there is
+# no room is refused, or sent once there is.
 SENDER = """
-import socket, struct, sys, time
+import select, socket, struct, sys, time
 peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 while peer.connect_ex(sys.argv[1]):
     time.sleep(0.01)
@@ -41,8 +42,11 @@ peer.setblocking(False)
 number = 0
 for line in sys.stdin:
     refused, times = 0, []
-    for _ in range(int(line)):
+    count, waits = map(int, line.split())
+    for _ in range(count):
         try:
+            if waits:
+                select.select([], [peer], [])
             peer.send(struct.pack("<QQIBB2x8s", number, 0, 1, 8, 0, bytes(8)))
             number += 1
         except BlockingIOError:
@@ -68,8 +72,8 @@ class Sender:
         self.process.kill()
         self.process.communicate()
 
-    def start(self, count):
-        self.process.stdin.write(f"{count}\n")
+    def start(self, count, *, waits=False):
+        self.process.stdin.write(f"{count} {waits:d}\n")
         self.process.stdin.flush()
 
     def result(self):
@@ -86,7 +90,7 @@ def hold_the_interpreter(until):
 
 @pytest.mark.slow
 def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
-    """An AF_UNIX socket of the default size holds 277 such packets."""
+    """An AF_UNIX socket of the default size holds 277 such packets; the sender waits for room."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(str(tmp_path / "s"))
         listener.listen()
@@ -104,7 +108,7 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
             accepted, _, _ = sender.result()
             wait_for(lambda: taken(accepted), "the first packets")
             before = accepted
-            sender.start(500)
+            sender.start(500, waits=True)
             hold_the_interpreter(sender.process.stdout)
             accepted, refused, sent_ns = sender.result()
             assert refused == 0
