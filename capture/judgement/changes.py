@@ -105,7 +105,7 @@ def _jumps(blocks: Blocks, exposure: Exposure) -> list[tuple[float, Jump]]:
         noises = [noise_of(*row, rho) for row in zip(values, weights, strict=True)]
         for k, (value, weight) in enumerate(zip(values, weights, strict=True)):
             compared = len(exposure.group(k)) >= ENOUGH_LIKE
-            like = common_noise([noises[j] for j in exposure.group(k) if j != k])
+            like = common_noise([noises[j] for j in exposure.group(k) if j != k], noises[k])
             shift = largest_shift(
                 value, weight, rho, tests, blocks.shortest, compared=compared, like=like
             )

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, digamma, polygamma, stdtrit
+from scipy.special import chdtri, digamma, fdtri, polygamma, stdtrit
 
 from ..common.arrays import FloatArray, IntArray
-from .levels import COVERAGE, ENOUGH_LIKE, FEWEST, FULL, LEVEL, ROBUST, TAME, TINY
+from .levels import COVERAGE, ENOUGH_LIKE, FEWEST, FULL, LEVEL, ROBUST, TAME, TINY, WHOLE
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,26 @@ UNKNOWN = Noise(0.0, 0.0)
 
 
 def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> Noise:
-    """Return the noise of one series of shape (b,) if nothing changed in it."""
+    """Return the noise of one series of shape (b,), whether or not its level shifts.
+
+    A shift is in one difference of neighbours alone. Half the mean square of all is the variance,
+    with two thirds of the degrees of freedom (von Neumann et al., Ann. Math. Stat. 12, 1941, doi
+    10.1214/aoms/1177731746).
+    """
     known = weights > 0
-    freedom = int(known.sum()) - 1
-    if freedom < 1:
+    if int(known.sum()) <= 2:
         return UNKNOWN
     scale = np.sqrt(weights[known])
     whole, target = _whitened(scale, rho), _whitened(scale * values[known], rho)
-    left = float(target @ target) - float(whole @ target) ** 2 / float(whole @ whole)
-    return Noise(max(left, TINY) / freedom, freedom)
+    steps = np.diff(target - float(whole @ target) / float(whole @ whole) * whole)
+    return Noise(max(float(np.mean(steps**2)) / 2, TINY), WHOLE * steps.size)
 
 
-def common_noise(noises: Sequence[Noise]) -> Noise:
+def common_noise(noises: Sequence[Noise], own: Noise = UNKNOWN) -> Noise:
     """Return what the noise of several like joints tells of that of one more (Smyth, section 6.2).
 
-    The joints' own scatter is taken at its upper limit of 90 %; that of few joints tells little.
+    The joints' own scatter is taken at its upper limit of 90 %; that of few joints tells little,
+    and nothing of one whose own noise is beyond theirs at the level of the judgement.
     """
     known = [noise for noise in noises if noise.freedom > 0]
     if len(known) < ENOUGH_LIKE - 1:
@@ -94,25 +99,27 @@ def common_noise(noises: Sequence[Noise]) -> Noise:
     pooled = 2 * float(half.sum())
     # trigamma(x) is above 1/x + 1/(2 x^2).
     freedom = pooled if excess <= 0 else min(pooled, (1 + np.sqrt(1 + 2 * excess)) / excess)
-    return Noise(float(np.exp(middle + digamma(freedom / 2) - np.log(freedom / 2))), freedom)
+    variance = float(np.exp(middle + digamma(freedom / 2) - np.log(freedom / 2)))
+    beyond = own.variance > variance * float(fdtri(max(own.freedom, 1), freedom, 1 - LEVEL))
+    return UNKNOWN if beyond else Noise(variance, float(freedom))
 
 
 def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Return weights without those of a block that is far from both its neighbours.
 
     Alone it is no change. Far is beyond :data:`TAME` robust standard deviations of what blocks
-    differ from the median of three.
+    differ from the median of three, the first and the last three at the ends.
     """
     result = weights.copy()
     for row, weight in zip(values, result, strict=True):
         known = np.flatnonzero(weight > 0)
         if known.size >= FEWEST:
-            inner = row[known]
-            middle = np.median([inner[:-2], inner[1:-1], inner[2:]], axis=0)
-            away = np.abs(inner[1:-1] - middle)
+            value = row[known]
+            middle = np.pad(np.median([value[:-2], value[1:-1], value[2:]], axis=0), 1, "edge")
+            away = np.abs(value - middle)
             if away.any():
                 far = away > TAME * ROBUST * np.median(away[away > 0])
-                weight[known[1:-1][far]] = 0.0
+                weight[known[far]] = 0.0
     return result
 
 

@@ -54,7 +54,7 @@ def found(values, weights):
     noises = [noise_of(v, w, rho) for v, w in zip(values, weights, strict=True)]
     pairs = []
     for k, (v, w) in enumerate(zip(values, weights, strict=True)):
-        like = common_noise(noises[:k] + noises[k + 1 :])
+        like = common_noise(noises[:k] + noises[k + 1 :], noises[k])
         shift = largest_shift(v, w, rho, tests, 3, compared=True, like=like)
         pairs.append((shift, drift_of(v, w, rho, tests)))
     return pairs
@@ -82,18 +82,21 @@ def test_chance_alone_makes_no_change_of_joints_of_which_each_has_a_noise_of_its
     assert wrong <= 5  # 0.5 % of a quarter of the quantities; 99 % limit of 150 sessions at 1 %
 
 
-def test_the_noise_of_a_series_is_that_of_its_inverse_covariance():
+@pytest.mark.parametrize("step", [0.0, 1.5])
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_the_noise_of_a_series_is_the_same_with_a_step(rho, step):
+    """Of what is new from block to block: (1 - rho^2) times the weighted variance."""
     rng = np.random.default_rng(2)
-    n, rho = 15, 0.6
-    values, weights = rng.normal(size=n), rng.uniform(0.5, 2, n)
-    every = np.arange(n)
-    covariance = rho ** np.abs(every[:, None] - every) / np.sqrt(np.outer(weights, weights))
-    inverse = np.linalg.inv(covariance)
-    left = values - inverse.sum(axis=0) @ values / inverse.sum()
-    expected = (1 - rho**2) * left @ inverse @ left / (n - 1)
-    # Blocks without weight are none.
-    values, weights = np.append(values, 100.0), np.append(weights, 0.0)
-    assert noise_of(values, weights, rho) == Noise(pytest.approx(expected), n - 1)
+    found = []
+    for _ in range(300):
+        weights = rng.uniform(0.5, 2, 40)
+        values = drawn(rng, rho, joints=1)[0] / np.sqrt(weights) + step * (np.arange(40) > 17)
+        # Blocks without weight are none.
+        found.append(noise_of(np.append(values, 100.0), np.append(weights, 0.0), rho))
+    variance = np.array([noise.variance for noise in found])
+    assert np.mean(variance) == pytest.approx(1 - rho**2, rel=0.05 if step == 0 else 0.2)
+    freedom = 2 / np.var(variance / np.mean(variance))
+    assert found[0].freedom == pytest.approx(freedom, rel=0.25)
 
 
 @pytest.mark.parametrize("freedom", [4, 12])
@@ -111,6 +114,13 @@ def test_joints_of_one_noise_are_one():
     like = common_noise([Noise(2 * rng.chisquare(10) / 10, 10) for _ in range(400)])
     assert like.freedom > 60
     assert like.variance == pytest.approx(2, rel=0.05)
+
+
+def test_like_joints_tell_nothing_of_one_that_is_noisier_than_they():
+    rng = np.random.default_rng(6)
+    others = [Noise(2 * rng.chisquare(10) / 10, 10) for _ in range(20)]
+    assert common_noise(others, Noise(4.0, 10)) == common_noise(others)
+    assert common_noise(others, Noise(20.0, 10)) == Noise(0.0, 0.0)
 
 
 def test_too_few_joints_tell_nothing_of_the_noise_of_another():
@@ -158,3 +168,13 @@ def test_blocks_in_which_a_response_settles_count_as_time():
     shift = largest_shift(values, weights, 0.0, 4, 6, compared=True)
     assert shift is not None
     assert (shift.first, shift.last) == (0, 6)
+
+
+@pytest.mark.parametrize("block", [0, -1])
+def test_one_block_alone_at_an_end_is_left_out(block):
+    values = drawn(np.random.default_rng(10), 0.0)
+    values[1, block] = 1000
+    weights = without_single(values, np.ones_like(values))
+    assert weights[1, block] == 0
+    values[1, [0, 1]] = 1000.0  # two are a change
+    assert without_single(values, np.ones_like(values))[1, :2].all()
