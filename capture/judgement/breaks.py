@@ -1,6 +1,6 @@
 """A lasting change of a joint's gain, lag or offset: a break of one regression over the record.
 
-Ordinary work tells of a gain or a lag only where it moves, so that few blocks of time know either
+Ordinary work shows a gain or a lag only where it moves, so that few blocks of time know either
 (:mod:`.shifts` needs eight). The residual of a joint's response is regressed over the whole record,
 
     r(t) = b0 + b1 p(t) - b2 p'(t) + c z(t) [t >= t0] + e(t),                                  (1)

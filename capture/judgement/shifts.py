@@ -81,10 +81,10 @@ def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> Noise:
 
 
 def common_noise(noises: Sequence[Noise], own: Noise = UNKNOWN) -> Noise:
-    """Return what the noise of several like joints tells of that of one more (Smyth, section 6.2).
+    """Estimate the noise of a joint from that of several like it (Smyth, section 6.2).
 
-    The joints' own scatter is taken at its upper limit of 90 %; that of few joints tells little,
-    and nothing of one whose own noise is beyond theirs at the level of the judgement.
+    The joints' own scatter is taken at its upper limit of 90 %; that of few joints weighs little,
+    and not at all for one whose own noise is beyond theirs at the level of the judgement.
     """
     known = [noise for noise in noises if noise.freedom > 0]
     if len(known) < ENOUGH_LIKE - 1:
@@ -169,7 +169,7 @@ def largest_shift(
     """Return the most certain run of blocks, or None if none is beyond the level.
 
     Args:
-        like: What the noise of like joints tells of its.
+        like: Its noise as estimated from like joints.
         compared: Whether like joints have taken off what a model leaves: then what is left is
             chance, and the plain difference of means must be beyond it, too.
     """
