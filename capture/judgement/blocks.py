@@ -47,6 +47,29 @@ TERMS = len(QUANTITIES) - 1
 
 
 @dataclass(frozen=True)
+class Jump:
+    """A change of one quantity of one joint.
+
+    Attributes:
+        joint: Its index.
+        quantity: Of :data:`QUANTITIES`, or ``drift`` of the offset.
+        change: From before to after: [rad], relative to before, [s], logarithm of the ratio.
+        error: Its standard error.
+        first_s: When it changed [s].
+        last_s: When it was as before again [s]; inf for a lasting change.
+        block_s: Length of a block [s]: the times are known to half of it at best.
+    """
+
+    joint: int
+    quantity: str
+    change: float
+    error: float
+    first_s: float
+    last_s: float
+    block_s: float
+
+
+@dataclass(frozen=True)
 class Blocks:
     """Estimates of k joints in b blocks, with the weights of each, shape (q, k, b)."""
 
@@ -101,7 +124,15 @@ def blocks_of(course: Course, exposure: Exposure, usable: BoolArray) -> Blocks |
 
 
 def rows_of(course: Course, exposure: Exposure, usable: BoolArray, k: int) -> FloatArray:
-    """Return one, a response, its negative rate and the residual, shape (4, n)."""
+    """Return one, a response about its mean, its negative rate and the residual, shape (4, n).
+
+    Args:
+        usable: Steps of the joint that are looked at, shape (n,).
+        k: The joint.
+
+    Returns:
+        Without unit, [rad], [rad/s] and [rad].
+    """
     response = exposure.fitted[k]
     rate = np.gradient(response, course.step_s)
     level = float(response @ usable) / max(int(usable.sum()), 1)
@@ -109,7 +140,17 @@ def rows_of(course: Course, exposure: Exposure, usable: BoolArray, k: int) -> Fl
 
 
 def moments_of(weighted: FloatArray, rows: FloatArray, starts: IntArray, width: int) -> FloatArray:
-    """Return the sums of the products of four rows in each block, shape (b, 4, 4)."""
+    """Return the sums of the products of rows in each block.
+
+    Args:
+        weighted: The rows times the weight of each sample, shape (4, n).
+        rows: Of :func:`rows_of`, shape (4, n).
+        starts: First sample of each block, shape (b,).
+        width: Samples of a block.
+
+    Returns:
+        Shape (b, 4, 4).
+    """
     stop = int(starts[-1]) + width
     products = weighted[:, None, :stop] * rows[None, :, :stop]
     return np.moveaxis(np.add.reduceat(products, starts, axis=2), 2, 0)
@@ -188,16 +229,19 @@ def _regressed(moments: FloatArray, width: int) -> tuple[FloatArray, FloatArray,
 
 
 def correlation_s(
-    course: Course, exposure: Exposure, usable: BoolArray, rhythms: Sequence[bool]
+    course: Course, exposure: Exposure, usable: BoolArray, in_parts: Sequence[bool]
 ) -> float:
-    """Return the median time after which the residuals' correlation is below 1/e.
+    """Return the median time over the joints after which the residual's correlation is below 1/e.
 
-    Of a rhythm it is that within parts of the record, so that a change doesn't make it longer.
+    Args:
+        usable: Steps that are looked at, shape (k, n).
+        in_parts: Of which joints it is that within parts of the record, so that a change doesn't
+            make it longer, k.
     """
     times: list[float] = []
     for k in range(course.position.shape[0]):
         residual = (course.position[k] - exposure.fitted[k])[usable[k]]
-        parts = FEWEST if rhythms[k] else 1
+        parts = FEWEST if in_parts[k] else 1
         width = residual.size // parts
         if residual.size < 2 * FEWEST:
             continue

@@ -17,12 +17,13 @@ motion, a break explains besides at least half of what the response leaves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 from scipy.special import stdtrit
 
 from ..common.arrays import BoolArray, FloatArray
-from .blocks import EPS, MOST, QUANTITIES, TERMS, correlation_s, moments_of, rows_of
+from .blocks import EPS, MOST, QUANTITIES, TERMS, Jump, correlation_s, moments_of, rows_of
 from .exposure import LIKE_LAG_S, Exposure
 from .levels import (
     ANGLE_MARGIN_RAD,
@@ -62,37 +63,15 @@ class Breaks:
     left: FloatArray
 
 
-@dataclass(frozen=True)
-class Break:
-    """A lasting change of one joint.
-
-    Attributes:
-        joint: Its index.
-        quantity: ``offset``, ``gain`` or ``lag``.
-        change: From before to after: [rad], relative to before, [s].
-        error: Its standard error.
-        at_s: When [s].
-        block_s: Length of a block [s].
-        drop: Of the sum of squares.
-    """
-
-    joint: int
-    quantity: str
-    change: float
-    error: float
-    at_s: float
-    block_s: float
-    drop: float
-
-
-def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[Break]:
+def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[tuple[float, Jump]]:
     """Find the break of each joint that explains most.
 
     Args:
         usable: Steps that are looked at, shape (k, n).
 
     Returns:
-        Those beyond the level, of which the response leaves half or more, and that matter.
+        Those beyond the level that explain half or more of what the response leaves, and that
+        matter, each with the part of the sum of squares that it explains [rad^2].
     """
     joints = len(course.command)
     length_s = float(course.t_s[-1] - course.t_s[0])
@@ -106,7 +85,7 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[B
     moments = [moments_of(r * usable[k], r, starts, width) for k, r in enumerate(rows)]
     breaks = [breaks_of(each) for each in moments]
     block_s = width * course.step_s
-    found: list[Break] = []
+    found: list[tuple[float, Jump]] = []
     for k, own in enumerate(breaks):
         others = [breaks[j].change for j in exposure.group(k) if j != k]
         change, error = _beside(own, others)
@@ -116,14 +95,15 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[B
         if not shown.any():
             continue
         q, cut = np.unravel_index(int(np.argmax(np.where(shown, own.drop, 0.0))), shown.shape)
-        if _matters(int(q), float(change[q, cut]), float(error[q, cut]), moments[k]):
-            size, half = float(change[q, cut]), float(error[q, cut])
-            if QUANTITIES[q] == "gain":
-                size /= max(1 + float(own.before[q, cut]), TINY)
-            at_s = float(course.t_s[0]) + (int(cut) + 1) * block_s
-            found.append(
-                Break(k, QUANTITIES[q], size, half, at_s, block_s, float(own.drop[q, cut]))
-            )
+        size, half = float(change[q, cut]), float(error[q, cut])
+        if not _matters(int(q), size, half, moments[k]):
+            continue
+        if QUANTITIES[q] == "gain":  # relative to before, when the joint responded at all
+            before = max(1 + float(own.before[q, cut]), QUARTER)
+            size, half = size / before, half / before
+        at_s = float(course.t_s[0]) + (int(cut) + 1) * block_s
+        jump = Jump(k, QUANTITIES[q], size, half, at_s, inf, block_s)
+        found.append((float(own.drop[q, cut]), jump))
     return found
 
 
@@ -160,7 +140,7 @@ def breaks_of(moments: FloatArray) -> Breaks:
 
     Args:
         moments: Sums over the samples of each block of the products of one, p, -p' and r, shape
-            (b, 4, 4).
+            (b, 4, 4); p and r in [rad].
     """
     total = moments.sum(axis=0)
     after = total - np.cumsum(moments, axis=0)[:-1]

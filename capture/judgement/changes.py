@@ -8,13 +8,12 @@ regression over the record (:mod:`.breaks`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf
 
 import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
-from .blocks import QUANTITIES, Blocks, blocks_of, without_common
+from .blocks import QUANTITIES, Blocks, Jump, blocks_of, without_common
 from .breaks import find_breaks
 from .exposure import LIKE_LAG_S, Exposure
 from .levels import (
@@ -43,29 +42,6 @@ NOISE_MARGIN = float(np.log(2.0))
 """Logarithm of the ratio of noise that matters: twice as much."""
 
 
-@dataclass(frozen=True)
-class Jump:
-    """A change of one quantity of one joint.
-
-    Attributes:
-        joint: Its index.
-        quantity: Of :data:`QUANTITIES`, or ``drift`` of the offset.
-        change: From before to after: [rad], relative to before, [s], logarithm of the ratio.
-        error: Its standard error.
-        first_s: When it changed [s].
-        last_s: When it was as before again [s]; inf for a lasting change.
-        block_s: Length of a block [s]: the times are known to half of it at best.
-    """
-
-    joint: int
-    quantity: str
-    change: float
-    error: float
-    first_s: float
-    last_s: float
-    block_s: float
-
-
 def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Jump]:
     """Find the largest change of each joint and quantity.
 
@@ -78,9 +54,7 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     usable = usable & _running(course, exposure)
     blocks = blocks_of(course, exposure, usable)
     found = [] if blocks is None else _jumps(blocks, exposure)
-    for each in find_breaks(course, exposure, usable):
-        start = each.change, each.error, each.at_s, inf, each.block_s
-        found.append((each.drop, Jump(each.joint, each.quantity, *start)))
+    found += find_breaks(course, exposure, usable)
     best: dict[int, tuple[float, Jump]] = {}
     for drop, jump in found:
         if jump.joint not in best or drop > best[jump.joint][0]:

@@ -16,9 +16,9 @@ import numpy as np
 from ..common.arrays import BoolArray, FloatArray, merged_ranges
 from ..common.process import in_threads
 from .apart import find_apart
-from .blocks import SHORTEST_S
+from .blocks import SHORTEST_S, Jump
 from .bursts import find_bursts
-from .changes import Jump, find_jumps
+from .changes import find_jumps
 from .exposure import Exposure, agrees, exposure_of, median_response, responds
 from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
 from .levels import (

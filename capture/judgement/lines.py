@@ -76,8 +76,9 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     middle = (begun + end) // 2
     found: dict[int, Line] = {}
     for first, last in ((begun, end), (begun, middle), (middle, end)):
-        for line in _lines(course, exposure, usable, slice(first, last)):
-            found.setdefault(line.joint, line)
+        if last - first >= FEWEST:
+            for line in _lines(course, exposure, usable, slice(first, last)):
+                found.setdefault(line.joint, line)
     return [found[k] for k in sorted(found)]
 
 

@@ -118,3 +118,11 @@ def test_a_change_in_work_of_few_motions_has_its_size_and_time(joints, quantity,
 @pytest.mark.parametrize("joints", [1, 3])
 def test_work_without_a_change_has_none(joints):
     assert all(judge(work(joints=joints, seed=seed)).changes == () for seed in range(12))
+
+
+def test_the_half_width_of_a_gain_is_relative_as_the_gain_is():
+    (found,) = judge(work(gain=-0.25)).changes
+    (other,) = judge(work(gain=0.25)).changes
+    # 0.95 before; the same step from 0.95 up and down, in units of what was before.
+    assert found.change == pytest.approx(-other.change, rel=0.05)
+    assert found.half_width < 0.1 * abs(found.change)
