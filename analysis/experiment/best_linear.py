@@ -28,7 +28,8 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ..response.frequency_response import Kind, joint_response, sound_lines
+from ..response.excitation import Kind
+from ..response.frequency_response import joint_response, sound_lines
 from ..response.nonparametric import LineResponse, line_power, noise_power
 from ..results import formats
 from ..results.estimate import Estimate

@@ -14,7 +14,8 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.series import Series
-from ..response.frequency_response import REPEATED, SAME_COMMAND, Kind, find_excitation
+from ..response.excitation import REPEATED, Kind, find_excitation
+from ..response.frequency_response import SAME_COMMAND
 from ..response.nonparametric import excited_lines, resampled
 from ..response.rhythm import DRIVEN_SHARE
 from ..signals.stretch import Options

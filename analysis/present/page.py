@@ -53,7 +53,7 @@ from ..results.comparison import Comparison
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment
 from ..session.cycles import CycleMaps
-from . import tables
+from . import response_tables, tables
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
 from .page_tables import (
@@ -198,7 +198,8 @@ def environment() -> Environment:
     for of in (*shared, softer, typeset, digits, sentence):
         made.filters[of.__name__] = of
     made.filters.update(decimals=formats.decimals_for, again=_commands_to_reproduce)
-    made.globals.update(tables=tables, grid=grid, num=number, est=estimate, p=p_value, known=known)
+    made.globals.update(tables=tables, responses=response_tables, grid=grid, known=known)
+    made.globals.update(num=number, est=estimate, p=p_value)
     script = _script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     made.globals.update(

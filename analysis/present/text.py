@@ -20,6 +20,7 @@ from ..results.coupling import Coupling
 from ..results.estimate import Estimate
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
+from .response_tables import frequency_table, motion_table, tracking_table, wave_table
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
@@ -232,12 +233,16 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print(answer.detail)
     moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
     shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
+    if analysis.tracking:
+        shown = [] if analysis.gait.frequency_hz.value is None else shown
+        shown.append(tracking_table(analysis.tracking))
     if analysis.frequency_response:
-        shown = [tables.frequency_table(analysis.frequency_response)]
+        shown = shown if analysis.tracking else []
+        shown.append(frequency_table(analysis.frequency_response))
     if analysis.free_motion is not None and analysis.free_motion.joints:
-        shown = [tables.motion_table(analysis.free_motion.joints)]
+        shown = [motion_table(analysis.free_motion.joints)]
         if analysis.free_motion.waves:
-            shown.append(tables.wave_table(analysis.free_motion.waves))
+            shown.append(wave_table(analysis.free_motion.waves))
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
     if any(one.value is not None for one in analysis.heterogeneity.values()):

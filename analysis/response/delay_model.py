@@ -5,21 +5,23 @@
 is fitted by weighted least squares, each line by its own variance; w_0 is the geometric mean of the
 frequencies. For each delay of a grid B and A are linear after Sanathanan and Koerner's iteration
 (IEEE Trans. Automatic Control 8 (1963) 56-58); the best of them starts Levenberg and Marquardt's.
-Orders grow until the residual is what the variances say it is; if none does, there is no model, and
-the delay is the group delay: the slope of the phase.
+Orders grow until the residual is what the variances say it is, and the delay's interval holds what
+the next orders say; if none passes, there is no model, and the delay is the group delay: the slope
+of the phase.
 
 Source: Pintelon & Schoukens, System Identification, 2nd ed. (Wiley 2012), chapters 9 and 11.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.judgement.levels import WIDTH
 
 ORDERS = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (1, 3), (2, 3))
 """Degrees of B and A, in the order in which they are tried."""
@@ -27,7 +29,12 @@ ORDERS = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (1, 3), (2, 3))
 LEVEL = 0.01
 """A model is refused where its residual is larger with a probability below this."""
 
+OPEN = 3
+"""Orders that pass, from the lowest on, over which the delay's interval is taken: poles that the
+data leave open share its phase."""
+
 _DELAYS = 21
+_REFINEMENTS, _FINER = 2, 5  # of the grid of delays, each by so much
 _ITERATIONS = 4
 _HOPELESS = 30.0  # mean square of the residual, in variances, from which no step makes it pass
 
@@ -38,7 +45,7 @@ class DelayModel:
 
     Attributes:
         delay_s: tau, or the group delay where ``orders`` is None [s].
-        delay_sd_s: Its standard deviation [s].
+        interval_s: Its 95 % interval over all orders that pass [s], at least 0.
         orders: Degrees of B and A; None where no model passed the residual test.
         numerator: Coefficients of B from s^0 on.
         denominator: Coefficients of A from s^0 on.
@@ -48,7 +55,7 @@ class DelayModel:
     """
 
     delay_s: float
-    delay_sd_s: float
+    interval_s: tuple[float, float]
     orders: tuple[int, int] | None
     numerator: FloatArray
     denominator: FloatArray
@@ -107,29 +114,43 @@ def fit_delay(
         np.asarray(1j * omega / scale, dtype=np.complex128), value, np.sqrt(2.0 / variance)
     )
     best = 0.0
+    passed: list[DelayModel] = []
     for orders in ORDERS:
         unknowns = 2 + sum(orders)
         left = 2 * omega.size - unknowns
         if left < unknowns:  # at least two numbers for each
             break
-        found = _fit(lines, *orders)
-        if found is None:
+        fit = _fit(lines, *orders)
+        if fit is None:
             continue
         # The variances are estimates: a ratio of chi-squares rather than a chi-square.
-        ratio = 2 * found.cost / left
+        ratio = 2 * fit.cost / left
         p = float(fdtrc(left, 2 * freedom * omega.size, float(ratio)))
         best = max(best, p)
-        sd = _delay_sd(found.jac)
+        sd = _delay_sd(fit.jac)
         if sd is None or sd * abs(lines.s[-1]) > np.pi:  # not determined
             continue
-        if found.x[0] < -2 * sd:  # an effect before its cause
+        if fit.x[0] < -2 * sd:  # an effect before its cause
             continue
         if p >= LEVEL:
-            x = np.asarray(found.x, dtype=np.float64)
+            x = np.asarray(fit.x, dtype=np.float64)
             b, a = x[1 : orders[0] + 2], np.append(1.0, x[orders[0] + 2 :])
-            return DelayModel(x[0] / scale, sd / scale, orders, b, a, scale, p)
+            ends = _interval(x[0] / scale, sd / scale)
+            passed.append(DelayModel(x[0] / scale, ends, orders, b, a, scale, p))
+            if len(passed) == OPEN:
+                break
+    if passed:
+        low = min(model.interval_s[0] for model in passed)
+        high = max(model.interval_s[1] for model in passed)
+        return replace(passed[0], interval_s=(low, high))
     delay_s, sd_s = group_delay(omega, value, variance)
-    return DelayModel(delay_s, sd_s, None, np.zeros(0), np.ones(1), scale, best)
+    ends = _interval(delay_s, sd_s)
+    return DelayModel(delay_s, ends, None, np.zeros(0), np.ones(1), scale, best)
+
+
+def _interval(delay_s: float, sd_s: float) -> tuple[float, float]:
+    """Return the 95 % interval of a delay, which isn't before its cause [s]."""
+    return max(delay_s - WIDTH * sd_s, 0.0), max(delay_s + WIDTH * sd_s, 0.0)
 
 
 def group_delay(
@@ -167,11 +188,19 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
     from scipy.optimize import least_squares
 
     best = None
-    for tau in np.linspace(0.0, 2 * np.pi, _DELAYS) / highest:
-        start = _linear(lines, tau, top, bottom)
-        cost = float(np.sum(lines.residual(start, top) ** 2))
-        if np.isfinite(cost) and (best is None or cost < best[0]):
-            best = cost, start
+    step = 2 * np.pi / highest / (_DELAYS - 1)
+    delays = step * np.arange(_DELAYS)
+    for _ in range(_REFINEMENTS + 1):
+        for tau in delays:
+            start = _linear(lines, tau, top, bottom)
+            cost = float(np.sum(lines.residual(start, top) ** 2))
+            if np.isfinite(cost) and (best is None or cost < best[0]):
+                best = cost, start
+        if best is None:
+            return None
+        # Precise lines take a start within what their noise allows.
+        delays = best[1][0] + step * np.arange(1 - _FINER, _FINER) / _FINER
+        step /= _FINER
     if best is None or best[0] > _HOPELESS * 2 * lines.s.size:
         return None
     found: Any = least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)

@@ -1,21 +1,16 @@
-"""Frequency responses of joints to commands of any kind: what a command excites, and the answer.
-
-A command is one of sines, a periodic multisine, a sweep, steps, or a band of noise.
-"""
+"""Frequency responses of joints to commands of any kind (:mod:`.excitation`)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.fft import next_fast_len
-from scipy.special import fdtri, stdtrit
+from scipy.special import stdtrit
 
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.process import in_threads
 
@@ -23,11 +18,12 @@ from ..estimators.series import Series, moves
 from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
+from .excitation import Excitation, Kind, excited_bins, find_excitation, swept_band
 from .nonparametric import (
+    ORDER,
     LineResponse,
     even_times,
     excited_lines,
-    find_tones,
     indirect_response,
     line_power,
     local_response,
@@ -37,155 +33,7 @@ from .nonparametric import (
 )
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-
-LEAST_SAMPLES = 128
-REPEATED = 1e-3
-"""Two periods are one if they differ by less than this share of the variance."""
-
-_LIKELY = 10 * REPEATED  # by the parabola
-_MOST_TRIED = 256  # a strong line of a multisine nearly repeats many times in a period
-_SEEN = 2048  # places at which the exact period is sought
-
-LEVELS = 8
-"""A command with at most so many values is one of steps."""
-
-_SWEPT = 0.97  # rank correlation of a sweep's instantaneous frequency with time
-_POWER = 1e-4  # of the strongest bin, smoothed: below it a bin isn't excited
-_SMOOTHING = 5  # bins
-_LONGEST = 16  # times the samples at the median interval: rates may change within a record
-
-
-class Kind(StrEnum):
-    """Kinds of excitation."""
-
-    TONES = "sum of sines"
-    PERIODIC = "periodic multisine"
-    CHIRP = "chirp"
-    STEPS = "steps"
-    NOISE = "broadband"
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """What one command excites.
-
-    Attributes:
-        tones_hz: Frequencies [Hz], where lines apart from each other make up the command.
-        period_s: Of a command that repeats at least twice [s], else NaN.
-    """
-
-    kind: Kind
-    tones_hz: FloatArray
-    period_s: float
-
-
-def find_excitation(command: Series) -> Excitation | None:
-    """Classify a command.
-
-    Args:
-        command: Its samples, without gaps.
-
-    Returns:
-        None where it doesn't move, has fewer than :data:`LEAST_SAMPLES` samples, or has gaps after
-        all: longer ones than the time that it covers.
-    """
-    if command.count < LEAST_SAMPLES or not moves(command.values):
-        return None
-    if command.t_s[-1] - command.t_s[0] > _LONGEST * command.count * command.period_s:
-        return None
-    # At its own sampling interval, so that steps stay between the same samples of each period.
-    even = resampled(command, np.arange(command.t_s[0], command.t_s[-1], command.period_s))
-    values = even - np.mean(command.values)
-    tones = find_tones(command, even)
-    repeated = _period(values) if tones is None or tones.size > 1 else None
-    period_s = float("nan") if repeated is None else repeated * command.period_s
-    if repeated is not None:
-        kind = Kind.PERIODIC
-    elif tones is not None:
-        kind = Kind.TONES
-    elif np.unique(command.values).size <= LEVELS:
-        kind = Kind.STEPS
-    else:
-        kind = Kind.CHIRP if _is_chirp(values) else Kind.NOISE
-    return Excitation(kind, np.zeros(0) if tones is None else tones, period_s)
-
-
-def excited_bins(spectrum: FloatArray) -> IntArray:
-    """Return the bins of a power spectrum that the command excites, without the constant.
-
-    Args:
-        spectrum: |U|^2 from bin 0 on, shape (n,).
-    """
-    smooth = np.convolve(spectrum, np.ones(_SMOOTHING) / _SMOOTHING, mode="same")
-    smooth[:1] = 0.0
-    return np.flatnonzero(smooth > _POWER * smooth.max())
-
-
-def _period(values: FloatArray) -> float | None:
-    """Return the period in samples, where the command repeats at least twice."""
-    from scipy.interpolate import CubicSpline
-
-    n = values.size
-    size = next_fast_len(2 * n, real=True)
-    correlation = np.fft.irfft(np.abs(np.fft.rfft(values, size)) ** 2, size)[:n]
-    energy = np.concatenate([[0.0], np.cumsum(values**2)])
-    lags = np.arange(1, n // 2 + 2)
-    # sum (u(t + L) - u(t))^2 over its mean square, by lag L.
-    both = energy[n] - energy[lags] + energy[n - lags]
-    differ = (both - 2 * correlation[lags]) / np.maximum(both, np.finfo(float).tiny)
-    if not (differ > 0.5).any():
-        return None
-    # The first small lags are smoothness, not repetition.
-    least = _minima(differ, int(np.argmax(differ > 0.5)))
-    before, at, after = differ[least - 1], differ[least], differ[least + 1]
-    # Near the period the difference is a parabola: its vertex lies between two samples.
-    bend = np.maximum(before - 2 * at + after, np.finfo(float).tiny)
-    beside = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
-    likely = np.flatnonzero(at - 0.25 * (before - after) * beside < _LIKELY)[:_MOST_TRIED]
-    if not likely.size:
-        return None
-    curve = CubicSpline(np.arange(n, dtype=np.float64), values)
-    for whole, part, known in zip(lags[least[likely]], beside[likely], at[likely], strict=True):
-        lag, left = _exact_lag(curve, float(whole + part))
-        if min(known, left) < REPEATED:
-            return lag if left <= known else float(whole)
-    return None
-
-
-def _minima(values: FloatArray, first: int) -> IntArray:
-    """Return the local minima behind an index, without both ends."""
-    inner = values[1:-1]
-    found = 1 + np.flatnonzero((inner <= values[:-2]) & (inner <= values[2:]))
-    return found[found > first]
-
-
-def _exact_lag(curve: CubicSpline, lag: float) -> tuple[float, float]:
-    """Return the lag of least difference between two samples, and the difference there.
-
-    The step of Gauss and Newton from the parabola's vertex; sum (u(t + L) - u(t))^2 over its mean
-    square, at up to :data:`_SEEN` places spread over the command.
-    """
-    last = curve.x[-1] - lag - 1
-    place = np.arange(0.0, last, max(1, round(last / _SEEN)))
-    now, rate = curve(place), curve(place + lag, 1)
-    power = float(rate @ rate)
-    step = float(rate @ (curve(place + lag) - now)) / power if power > 0 else 0.0
-    lag -= min(max(step, -0.5), 0.5)
-    later = curve(place + lag)
-    return lag, float(np.sum((later - now) ** 2) / np.sum(later**2 + now**2))
-
-
-def _is_chirp(values: FloatArray) -> bool:
-    """Whether the instantaneous frequency rises or falls all the time."""
-    from scipy.stats import spearmanr
-
-    crossings = np.flatnonzero(np.diff(np.signbit(values)))
-    if crossings.size < 8:
-        return False
-    found = spearmanr(np.arange(crossings.size - 1), np.diff(crossings))
-    return abs(float(found.statistic)) > _SWEPT
-
+    pass
 
 LINES = 40
 """Frequencies at which the response to a band is given."""
@@ -296,36 +144,65 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
         return
     t_s, step = even_times(start, stop, max(one.period_s for one in series))
     even = [resampled(one, t_s) for one in series]
+    whole = _of_band(even, step)
+    yield None if whole is None else sound_lines(whole)
     half = t_s.size // 2
-    for part in slice(None), slice(half), slice(half, None):
-        yield _of_band([one[part] for one in even], step)
+    for part in slice(half), slice(half, None):
+        yield None if whole is None else _of_band([one[part] for one in even], step, whole)
 
 
-def _of_band(even: Sequence[FloatArray], step: float) -> LineResponse | None:
+def _of_band(
+    even: Sequence[FloatArray], step: float, at: LineResponse | None = None
+) -> LineResponse | None:
     """Estimate a response at up to :data:`LINES` frequencies of the excited band.
 
     Args:
         even: Command, response and, if any, external reference, each of shape (n,).
         step: Their sampling interval [s].
+        at: Lines of the whole record, near which those of a part of it are.
+
+    Returns:
+        Values are NaN where the part isn't excited; None where there are too few bins.
     """
     # Without the mean; a straight line taken off would leak unlike the rest.
     u, y, *reference = (np.fft.rfft(one - one.mean()) for one in even)
     half = window(1, freedom=_FREEDOM)
-    bins = excited_bins(np.abs((reference or [u])[0]) ** 2)
-    bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * u.size)]
-    if u.size <= 4 * half or not bins.size:
+    if u.size <= 4 * half:
         return None
-    wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
-    chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
+    length_s = even[0].size * step
+    driver = even[-1] if reference else even[0]
+    bins = _usable_bins((reference or [u])[0], driver - driver.mean(), step, half)
+    if not bins.size:
+        return None
+    if at is None:
+        wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
+        chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
+    else:
+        chosen = np.unique(np.rint(at.frequency_hz * length_s).astype(np.int64))
+        chosen = chosen[(chosen > 0) & (chosen < u.size)]
     if reference:
         value, variance, freedom = indirect_response(y, u, reference[0], chosen, half)
     else:
         found = local_response(y, u[None], chosen, half)
         value, variance, freedom = found.value[:, 0], found.variance[:, 0], found.freedom
-    frequency = chosen / (even[0].size * step)
-    return sound_lines(
-        LineResponse(frequency, value, variance, np.full(chosen.size, float(freedom)))
-    )
+    value = np.where(np.isin(chosen, bins), value, np.nan)
+    return LineResponse(chosen / length_s, value, variance, np.full(chosen.size, float(freedom)))
+
+
+def _usable_bins(spectrum: ComplexArray, values: FloatArray, step: float, half: int) -> IntArray:
+    """Return the bins at which a response can be told.
+
+    Those of the command's energy, within the frequencies of a sweep, below a quarter of the
+    sampling rate, and with as many such bins in their window as it has unknowns: fewer would be
+    told from what leaks beside them.
+    """
+    bins = excited_bins(np.abs(spectrum) ** 2)
+    if (band := swept_band(values, step)) is not None:
+        frequency = bins / (values.size * step)
+        bins = bins[(frequency >= band[0]) & (frequency <= band[1])]
+    bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * spectrum.size)]
+    beside = np.searchsorted(bins, bins + half, side="right") - np.searchsorted(bins, bins - half)
+    return bins[beside >= 2 * (ORDER + 1)]
 
 
 def sound_lines(lines: LineResponse) -> LineResponse:
@@ -398,8 +275,7 @@ def joint_response(
     lag = -np.angle(lines.value)
     delay = Estimate()
     if np.isfinite(model.delay_s):
-        width = 1.96 * model.delay_sd_s
-        delay = Estimate(model.delay_s, (model.delay_s - width, model.delay_s + width))
+        delay = Estimate(max(model.delay_s, 0.0), model.interval_s)
     return JointFrequencyResponse(
         joint=joint,
         excitation=excitation,
@@ -474,12 +350,17 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
 
 
 def _agreement(first: LineResponse | None, second: LineResponse | None) -> tuple[int, int] | None:
-    """Compare the two halves of a record, at the lines that both have."""
+    """Count the lines of both halves of a record that agree, and those compared.
+
+    They agree if they differ by no more than the root of the sum of their squared 95 % radii.
+    """
     if first is None or second is None:
         return None
     if first.frequency_hz.size != second.frequency_hz.size:
         return None
-    differ = np.abs(first.value - second.value) ** 2
-    quantile = fdtri(2, 2 * (first.freedom + second.freedom), 0.95)
-    agree = differ <= (first.variance + second.variance) * quantile
+    differ = np.abs(first.value - second.value)
+    both = np.isfinite(differ)
+    if not both.any():
+        return None
+    agree = differ[both] <= np.hypot(first.radius(), second.radius())[both]
     return int(agree.sum()), int(agree.size)

@@ -16,7 +16,7 @@ from .answer import Answer, Artefact, DeadBand, Span
 from .body import BodyPoint, BodyResult, BodyShape, GroundContact
 from .coupling import Coupling
 from .estimate import Estimate, PresentedResult, Provenance, WithInterval
-from .frequency_response import FreeMotion, JointFrequencyResponse
+from .frequency_response import FreeMotion, JointFrequencyResponse, JointTracking
 
 if TYPE_CHECKING:
     from .oscillators import ChainCoupling
@@ -364,6 +364,7 @@ class Analysis(PresentedResult):
             oscillator's phase was logged.
         frequency_response: Of joints whose commands are no gait but excite a band or several
             frequencies.
+        tracking: How joints follow commands that are no gait: gain, lag and offset.
         closed_loop: What makes the commands of a frequency response depend on measured motion, as
             far as the log shows it, or None.
         free_motion: Where no commands were logged: amplitudes, lags and waves of the motion.
@@ -384,6 +385,7 @@ class Analysis(PresentedResult):
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
+    tracking: tuple[JointTracking, ...] = ()
     closed_loop: str | None = None
     free_motion: FreeMotion | None = None
     artefacts: tuple[Artefact, ...] = ()
@@ -407,6 +409,7 @@ class Analysis(PresentedResult):
             else _contact_dict(self.ground_contact),
             "energy": None if self.energy is None else _energy_dict(self.energy),
             "frequency_response": [_record(one) for one in self.frequency_response],
+            "tracking": [_record(joint) for joint in self.tracking],
             "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),

@@ -180,8 +180,9 @@ class StandOut:
         plane: ``horizontal``, ``vertical`` or ``chain``.
         group: Index of its rhythm group.
         rank: 1 for the joint that deviates most.
-        quantity: ``gain``, ``lag`` or ``offset``.
-        deviation: From the prediction of the others: relative for gain, rad for lag and offset.
+        quantity: ``gain``, ``lag`` or ``offset``, or ``delay`` where there is no gait.
+        deviation: From the prediction of the others: relative for gain, rad for lag and offset, s
+            for a delay.
         ci95: Simultaneous 95 % interval over all statements of the answer.
     """
 

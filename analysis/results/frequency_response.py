@@ -56,6 +56,32 @@ class JointFrequencyResponse:
 
 
 @dataclass(frozen=True)
+class JointTracking:
+    """Gain, lag and offset of one joint whose commands are no gait.
+
+    Attributes:
+        gain: At low frequency, response over command.
+        lag_s: Of slow motion: delay and time constants together [s]. It is 0 where the joint seems
+            to be earlier than its command.
+        offset_rad: Mean of the position less that of the delayed command [rad].
+        poles: Of the model beside the delay, 0 to 2.
+        held: Whether a command that is held until the next explains the motion better than lines
+            from one to the next.
+        explained: Share of the position's variance, at most 1.
+        commanded_rad: Range of the command [rad].
+    """
+
+    joint: str
+    gain: Estimate
+    lag_s: Estimate
+    offset_rad: Estimate
+    poles: int
+    held: bool
+    explained: float
+    commanded_rad: float
+
+
+@dataclass(frozen=True)
 class BestLinearJoint:
     """Best linear approximation of one joint's response to its own command, with its distortion.
 

@@ -15,14 +15,27 @@ from dataclasses import dataclass
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import some_names
 from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
+from undulog.capture.judgement.levels import FOLLOWS, QUARTER
 from undulog.capture.judgement.naming import NAMED
 
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, Artefact, NotFollowing, Shape, StandOut, Verdict
-from ..results.frequency_response import BodyWave, FreeMotion, JointFrequencyResponse
+from ..results.frequency_response import (
+    BodyWave,
+    FreeMotion,
+    JointFrequencyResponse,
+    JointTracking,
+)
 from .examine import Findings
-from .words import deviation_in_words, fault_in_words, rests_in_words, size_in_words
+from .words import (
+    deviation_in_words,
+    fault_in_words,
+    low_gains,
+    low_gains_in_words,
+    rests_in_words,
+    size_in_words,
+)
 
 
 @dataclass(frozen=True)
@@ -37,6 +50,7 @@ class Facts:
         artefacts: Of the joints' signals.
         warnings: Of the analysis: they hold the reason where there is no answer.
         frequency_response: Frequency responses, where there is no gait.
+        tracking: How the joints follow, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
         motion: Where no command is logged, else None.
     """
@@ -48,6 +62,7 @@ class Facts:
     findings: Findings
     warnings: tuple[str, ...]
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
+    tracking: tuple[JointTracking, ...] = ()
     left_out: str = ""
     motion: FreeMotion | None = None
     judgement: Judgement = NOTHING
@@ -121,6 +136,8 @@ def _named(facts: Facts) -> str:
     clauses += [clause_of(each, plain(each.joint)) for each in differences[:NAMED]]
     if judged.rests:
         clauses.append(rests_in_words(judged.rests))
+    if low := _low_gains(facts):
+        clauses.append(low_gains_in_words(low))
     changed = {change.joint for change in judged.changes}
     off = {rest.joint for rest in judged.rests}
     by_joint: dict[str, list[StandOut]] = {}
@@ -148,6 +165,15 @@ def _apart(facts: Facts) -> tuple[Apart, ...]:
     """Return the joints whose response lies apart, where no closer comparison names them."""
     compared = {*facts.findings.compared}
     return tuple(each for each in facts.judgement.apart if each.joint not in compared)
+
+
+def _low_gains(facts: Facts) -> tuple[JointTracking, ...]:
+    """Return joints of low gain of which no closer statement is made."""
+    judged, stand_out = facts.judgement, facts.findings.stand_out
+    named = {fault.joint for fault in facts.not_following}
+    for differences in (judged.changes, judged.extra, judged.apart, stand_out):
+        named |= {difference.joint for difference in differences}
+    return tuple(joint for joint in low_gains(facts.tracking) if joint.joint not in named)
 
 
 def _left_out(facts: Facts) -> str:
@@ -230,10 +256,29 @@ def _without_gait(facts: Facts) -> str:
     if facts.motion is not None:
         return _motion(facts, facts.motion)
     if made := [one for one in facts.warnings if one.startswith("times made from fps")]:
-        return f"Not periodic, {made[0].split(':')[0]}: no gain and no lag to compare."
+        why = f"Not periodic, {made[0].split(':')[0]}"
+        return _tracked(why, facts.tracking) or f"{why}: no gain and no lag to compare."
     if facts.frequency_response:
-        return _swept(facts.frequency_response)
-    return "No gait was found in this session, so there is no gain and no lag to compare."
+        return _swept(facts.frequency_response, facts.tracking)
+    no_gait = "No gait was found in this session, so there is no gain and no lag to compare."
+    return _tracked("No gait", facts.tracking) or no_gait
+
+
+def _tracked(why: str, tracking: Sequence[JointTracking]) -> str:
+    """Return the sentence on joints whose gain is known to a quarter; empty for none."""
+    follow = [
+        joint
+        for joint in tracking
+        if joint.explained >= FOLLOWS
+        and joint.gain.ci95 is not None
+        and joint.gain.ci95[1] - joint.gain.ci95[0] < 2 * QUARTER * (joint.gain.value or 0.0)
+    ]
+    if not follow:
+        return ""
+    gains = _range([joint.gain.value or 0.0 for joint in follow])
+    lags = _range([1e3 * (joint.lag_s.value or 0.0) for joint in follow])
+    joints = f"{len(follow)} joint{'s follow' if len(follow) > 1 else ' follows'}"
+    return f"{why}: {joints} with a gain of {gains} and a lag of {lags} ms."
 
 
 def _motion(facts: Facts, motion: FreeMotion) -> str:
@@ -268,16 +313,16 @@ def _wave(wave: BodyWave) -> str:
     )
 
 
-def _swept(found: Sequence[JointFrequencyResponse]) -> str:
+def _swept(found: Sequence[JointFrequencyResponse], tracking: Sequence[JointTracking]) -> str:
     """Return the sentence on frequency responses."""
     kinds = " and ".join(sorted({one.excitation for one in found}))
     band = _range([f for one in found for f in (one.frequency_hz[0], one.frequency_hz[-1])])
     text = f"No gait: the commands are of the kind {kinds}; frequency response of {len(found)} "
     text += f"joint{'s' if len(found) > 1 else ''} from {band} Hz"
     edges = [one.bandwidth_hz for one in found if one.bandwidth_hz is not None]
-    delays = [1e3 * one.delay_s.value for one in found if one.delay_s.value is not None]
+    lags = [1e3 * (joint.lag_s.value or 0.0) for joint in tracking if joint.explained >= FOLLOWS]
     text += f", -3 dB at {_range(edges)} Hz" if edges else ""
-    text += f", delay {_range(delays)} ms" if delays else ""
+    text += f", lag {_range(lags)} ms" if lags else ""
     shared = len(found) > 1 and len(found[0].shares_command) == len(found) - 1
     return text + (". All joints share one command: it is the response to that." if shared else ".")
 

@@ -7,11 +7,17 @@ from collections.abc import Sequence
 
 from undulog.capture.common.console import plain
 from undulog.capture.judgement.fault import RestsOff, clause_of
+from undulog.capture.judgement.levels import HALF, LARGEST_REST_RAD
 from undulog.capture.judgement.naming import NAMED
 
 from ..results import formats
 from ..results.answer import NotFollowing, StandOut
 from ..results.estimate import Estimate, Interval
+from ..results.frequency_response import JointTracking
+
+LOW_GAIN = 0.85
+"""Gain below which a joint is named though there is nothing to compare it with: hobby servos that
+hold a load against gravity give 0.8 to 0.9 of what they are commanded."""
 
 _KIND_WORDS = {
     "at_limit": "at a limit",
@@ -89,14 +95,44 @@ def deviation_in_words(each: StandOut) -> str:
     negative, text = each.deviation < 0, size_in_words(each.quantity, each.deviation, each.ci95)
     if each.quantity == "offset":
         return f"its mean {text} {'below' if negative else 'above'} its command's"
-    return f"{each.quantity} {text} {'less' if negative else 'more'}"
+    word = "lag" if each.quantity == "delay" else each.quantity
+    return f"{word} {text} {'less' if negative else 'more'}"
 
 
 def size_in_words(quantity: str, value: float, ci95: Interval) -> str:
-    """Return the magnitude of a difference with its interval, in percent or degrees."""
+    """Return the magnitude of a difference with its interval, in percent, degrees or ms."""
     sign = -1.0 if value < 0 else 1.0
     low, high = sorted(sign * end for end in ci95)
     size = Estimate(sign * value, (low, high))
     if quantity == "gain":
         return formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+    if quantity == "delay":
+        return formats.estimate(formats.scaled(size, 1e3), " ms", most=2)
     return formats.estimate(formats.degrees(size), "°", most=2)
+
+
+def low_gains(joints: Sequence[JointTracking]) -> tuple[JointTracking, ...]:
+    """Return joints whose gain is low, without anything to compare it with.
+
+    Of a motion within twice what healthy joints rest off, play and stick leave any gain.
+    """
+    return tuple(
+        joint
+        for joint in joints
+        if joint.explained >= HALF
+        and joint.commanded_rad > 2 * LARGEST_REST_RAD
+        and joint.gain.ci95 is not None
+        and joint.gain.ci95[1] < 1
+        and (joint.gain.value or 0.0) < LOW_GAIN
+    )
+
+
+def low_gains_in_words(joints: Sequence[JointTracking]) -> str:
+    """Return them as a clause, e.g. ``Pitch, Elbow follow with gains of 0.82 and 0.8``."""
+    gains = [f"{joint.gain.value or 0.0:.2g}" for joint in joints]
+    if len(joints) == 1:
+        return f"{plain(joints[0].joint)} follows with a gain of {gains[0]}"
+    if len(joints) > NAMED:
+        return f"{len(joints)} joints follow with gains of {min(gains)} to {max(gains)}"
+    names = ", ".join(plain(joint.joint) for joint in joints)
+    return f"{names} follow with gains of {', '.join(gains[:-1])} and {gains[-1]}"

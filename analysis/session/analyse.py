@@ -24,6 +24,7 @@ from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import closed_loop, session_couplings
+from ..parts.tracking.measure import Tracked, track_joints
 from ..response.fitting import GaitFit, fit_gait
 from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
@@ -33,9 +34,17 @@ from ..results.body import BodyResult, GroundContact
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
-from ..segments.session import compare_joints, following, not_following, stopped, unrefuted
+from ..segments.examine import Findings
+from ..segments.session import (
+    Following,
+    compare_joints,
+    following,
+    not_following,
+    stopped,
+    unrefuted,
+)
 from ..signals.artefacts import find_artefacts
-from ..signals.columns import Columns, drag_ratio, read_columns
+from ..signals.columns import Columns, by_plane, drag_ratio, read_columns
 from ..signals.stretch import (
     Options,
     SharedTimes,
@@ -179,6 +188,7 @@ def measure_session(
             *(commands, sound, warn), _series(columns.names, columns.excitation, stretch, origin_ns)
         )
     )
+    tracked = Tracked() if warn.refused else _tracked(session.robot, commands, sound, gait, follows)
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -208,8 +218,12 @@ def measure_session(
     )
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     commanded = columns.commanded()
-    findings = compare_joints(
-        session.robot, gait, joints, faulty=faulty, commanded=commanded, offsets=follows.offsets
+    findings = (
+        Findings(stand_out=tracked.stand_out)
+        if gait is None
+        else compare_joints(
+            session.robot, gait, joints, faulty=faulty, commanded=commanded, offsets=follows.offsets
+        )
     )
     analysis = Analysis(
         session=SessionFacts(
@@ -237,6 +251,7 @@ def measure_session(
         over_time=over_time,
         energy=energy,
         frequency_response=swept,
+        tracking=tracked.joints,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
         notes=warn.notes,
     )
@@ -248,6 +263,7 @@ def measure_session(
         findings,
         analysis.warnings,
         frequency_response=swept,
+        tracking=tracked.joints,
         left_out=left_out,
         motion=analysis.free_motion,
         judgement=follows.judgement,
@@ -303,6 +319,28 @@ def _free_motion(robot: Robot | None, moved: MotionFit | None, warn: Warn) -> Fr
     if motion.waves and robot is None:
         warn(Note(UNDECIDED_ENDS))
     return motion
+
+
+def _tracked(
+    robot: Robot | None,
+    commands: Mapping[str, Series],
+    sound: Mapping[str, Series],
+    gait: GaitFit | None,
+    follows: Following,
+) -> Tracked:
+    """Measure how joints follow commands that are no gait, and compare those of one plane.
+
+    Beside a gait they aren't compared: it is a few joints whose commands are none. Frames of made
+    times hold what was sampled earlier or later: their joints aren't compared either, nor are those
+    that the judgement names.
+    """
+    answered = () if gait is None else gait.all_answered
+    others = {name: series for name, series in commands.items() if name not in answered}
+    alone = follows.in_frames or gait is not None
+    planes = by_plane(robot, () if alone else others).values()
+    judged = follows.judgement
+    statements = (*judged.faults, *judged.changes, *judged.extra, *judged.apart)
+    return track_joints(others, sound, planes, {each.joint for each in statements})
 
 
 def _series(

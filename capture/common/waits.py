@@ -21,9 +21,10 @@ LIMIT_S = 120.0
 """Longest wait without progress on a thread or a disk of this computer [s]. A busy computer may
 let a thread rest for seconds; a network drive that comes back does so within a minute."""
 
-KILLED_S = 10.0
+KILLED_S = 60.0
 """Longest wait for a process that was killed [s]: the kernel ends one within milliseconds, unless a
-device that does not answer holds it."""
+device that does not answer holds it; a viewer of many threads and gigabytes took more than ten
+seconds beside four busy programs on two cores."""
 
 _LOOK_S = 0.05  # between two looks: a request to stop is noticed as fast as one sees
 _MOST_S = 1.0  # that one look counts [s]; more, and this process was stopped itself

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.frequency_response import Kind, find_excitation
+from undulog.analysis.response.excitation import Kind, find_excitation
 
 T = np.arange(0.0, 60.0, 0.01)
 RNG = np.random.default_rng(0)

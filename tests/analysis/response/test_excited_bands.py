@@ -9,24 +9,27 @@ from scipy.interpolate import CubicSpline
 
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.delay_model import DelayModel
-from undulog.analysis.response.frequency_response import (
+from undulog.analysis.response.excitation import (
     Excitation,
     Kind,
+    _exact_lag,
+    _is_chirp,
+    _minima,
+    _period,
+    excited_bins,
+    find_excitation,
+    swept_band,
+)
+from undulog.analysis.response.frequency_response import (
     _agreement,
     _bandwidth,
     _distortion,
     _estimates,
-    _exact_lag,
-    _is_chirp,
-    _minima,
     _of_band,
-    _period,
     _resonance,
     _same_commands,
     _unbroken,
     estimate,
-    excited_bins,
-    find_excitation,
     frequency_responses,
     joint_response,
     sound_lines,
@@ -51,14 +54,43 @@ def lines_of(gain, variance=1e-6, freedom=9.0, frequency=None):
 # -- what is excited ------------------------------------------------------------------------------
 
 
-def test_bins_are_excited_by_their_mean_over_five():
-    spectrum = np.zeros(40)
-    spectrum[[0, 10, 20, 30]] = 9e9, 5.0, 5.5e-4, 4.5e-4
-    spectrum[0] = 0.0
-    expected = [*range(8, 13), *range(18, 23)]  # 1.1 and 0.9 of a ten-thousandth
-    assert excited_bins(spectrum).tolist() == expected
-    spectrum[0] = 5.0
-    assert excited_bins(spectrum).tolist() == [1, 2, *expected]
+def test_the_bins_of_a_command_hold_all_but_a_hundredth_of_its_energy():
+    rng = np.random.default_rng(3)
+    spectrum = 1e-5 * rng.random(400)
+    spectrum[100:200] = 1.0 + rng.random(100)
+    bins = excited_bins(spectrum)
+    assert 100 <= bins[0] < 104
+    assert 195 <= bins[-1] < 202
+    assert 0.985 <= spectrum[bins].sum() / spectrum.sum() <= 1.0
+    assert (np.diff(bins) > 0).all()
+    assert excited_bins(np.zeros(40)).size == 0
+    spectrum[0] = 1e9
+    assert excited_bins(spectrum)[0] in (1, 2)  # without the constant, but for what it leaks
+
+
+@pytest.mark.parametrize("rising", [True, False])
+def test_nothing_is_given_outside_of_a_sweep(rising):
+    """From 0.10 to 2.77 Hz in 120 s, as an arm was commanded."""
+    t = np.arange(0.0, 120.0, STEP)
+    swept = np.sin(2 * np.pi * (0.1 * t + 2.67 * t**2 / 240))
+    u = swept if rising else swept[::-1]
+    low, high = swept_band(u - u.mean(), STEP)
+    assert 0.1 <= low < 0.2
+    assert 2.6 < high <= 2.77
+    y = signal.lfilter([0.2], [1, -0.8], u) + 1e-3 * RNG.normal(size=t.size)
+    (found,) = frequency_responses({"a": series(u, t)}, {"a": series(y, t)}, pytest.fail)
+    assert found.excitation == "chirp"
+    assert found.frequency_hz[0] >= 0.1
+    assert found.frequency_hz[-1] <= 2.77
+    assert found.frequency_hz[-1] > 2.5
+
+
+def test_a_move_of_a_few_bins_has_no_line():
+    """Ten seconds of an industrial robot: four lines of its command, beside which all is noise."""
+    t = np.arange(0.0, 10.0, 0.004)
+    s = np.clip(t / 5.0, 0.0, 1.0)
+    u = 10 * s**3 - 15 * s**4 + 6 * s**5 - np.clip((t - 5.0) / 5.0, 0, 1) ** 2
+    assert frequency_responses({"a": series(u, t)}, {"a": series(0.9 * u, t)}, pytest.fail) == ()
 
 
 def test_a_command_has_to_move_often_and_without_long_gaps():
@@ -159,7 +191,7 @@ def test_a_band_has_forty_lines_of_the_local_polynomial_method():
     result = _of_band([u + 3.0, y - 2.0], STEP)
     spectra = [np.fft.rfft(row - row.mean()) for row in (u, y)]
     half = window(1, freedom=12)
-    assert result.frequency_hz[0] == pytest.approx((half // 2 + 1) / 80.0)
+    assert result.frequency_hz[0] == pytest.approx((half // 2 + 1) / 80.0, abs=2 / 80.0)
     assert result.frequency_hz[-1] <= 0.25 / STEP
     assert result.frequency_hz[-1] == pytest.approx(0.25 / STEP, rel=0.01)
     bins = np.rint(result.frequency_hz * 80.0).astype(int)
@@ -199,7 +231,9 @@ def test_a_band_needs_samples_of_all():
     assert list(_estimates([series(u), short], excitation)) == [None, None, None]
     halves = list(_estimates([series(u), series(2 * u)], excitation))
     assert [row is not None for row in halves] == [True] * 3
-    np.testing.assert_allclose(halves[1].value, 2.0, atol=1e-6)
+    there = np.isfinite(halves[1].value)
+    assert np.mean(there) > 0.8
+    np.testing.assert_allclose(halves[1].value[there], 2.0, atol=1e-6)
     # At the sampling interval of the slower channel.
     slow = list(_estimates([series(u), series(2 * u[::2], T[::2])], excitation))
     assert slow[0].frequency_hz[-1] == pytest.approx(0.25 / (2 * STEP), rel=0.01)
@@ -271,13 +305,11 @@ def test_a_joint_has_students_intervals():
     np.testing.assert_allclose(result.lag_ci95[2], expected)
     np.testing.assert_allclose(result.coherence, gain**2 / (gain**2 + 1e-3))
     assert (result.joint, result.excitation, result.shares_command) == ("j", "chirp", ("k",))
-    assert result.delay_s.ci95[1] - result.delay_s.value == pytest.approx(
-        result.delay_s.value - result.delay_s.ci95[0]
-    )
+    assert 0 <= result.delay_s.ci95[0] <= result.delay_s.value <= result.delay_s.ci95[1]
 
 
 def no_model():
-    return DelayModel(0.0, 0.0, None, np.zeros(0), np.ones(1), 1.0, 0.0)
+    return DelayModel(0.0, (0.0, 0.0), None, np.zeros(0), np.ones(1), 1.0, 0.0)
 
 
 def test_the_bandwidth_is_where_the_gain_has_fallen_by_three_decibels():
@@ -289,7 +321,7 @@ def test_the_bandwidth_is_where_the_gain_has_fallen_by_three_decibels():
     flat = lines_of([1.0, 0.9, 0.8, 0.75], frequency=frequency)
     assert _bandwidth(flat, np.abs(flat.value), no_model()) is None
     # By a model of first order: exactly at its corner, but for the gain of the lowest line.
-    corner = DelayModel(0.0, 0.0, (0, 1), np.ones(1), np.array([1.0, 0.5]), 2 * np.pi, 1.0)
+    corner = DelayModel(0.0, (0.0, 0.0), (0, 1), np.ones(1), np.array([1.0, 0.5]), 2 * np.pi, 1.0)
     hz = np.sqrt(2 * (4 + 1.0) - 4)  # |1 / (1 + j f / 2)|^2 is half of that at 1 Hz
     assert _bandwidth(lines, np.abs(lines.value), corner) == pytest.approx(hz, rel=1e-3)
 
@@ -303,9 +335,12 @@ def test_a_resonance_stands_out_of_the_intervals():
 
 def test_halves_agree_within_their_noise():
     first, second = lines_of(np.ones(6), 0.01, 6.0), lines_of(np.ones(6), 0.02, 9.0)
-    reach = np.sqrt(0.03 * stats.f.ppf(0.95, 2, 30))
+    reach = np.sqrt(0.01 * stats.f.ppf(0.95, 2, 12) + 0.02 * stats.f.ppf(0.95, 2, 18))
     value = 1 + reach * np.array([0.0, 0.99, 0.99j, -0.99, 1.01, 1.01j])
     assert _agreement(first, replace(second, value=value)) == (4, 6)
+    value[[0, 5]] = np.nan  # not excited in this half
+    assert _agreement(first, replace(second, value=value)) == (3, 4)
+    assert _agreement(first, replace(second, value=np.full(6, np.nan))) is None
     assert _agreement(None, second) is None
     assert _agreement(first, None) is None
     assert _agreement(first, lines_of(np.ones(5))) is None

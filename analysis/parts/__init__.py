@@ -1,0 +1,1 @@
+"""Parts of the analysis, each in a folder of its own: measure, result, show."""

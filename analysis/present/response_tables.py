@@ -1,0 +1,138 @@
+"""Tables of sessions without a gait: frequency responses, tracking, and motion without commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ..results.estimate import Estimate
+from ..results.formats import degrees, scaled
+from ..results.frequency_response import (
+    DIRECT,
+    BodyWave,
+    JointFrequencyResponse,
+    JointMotion,
+    JointTracking,
+)
+from .tables import Column, Table, typical
+
+
+def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:
+    """Return frequency responses in short: band, bandwidth, delay, distortion, repeatability."""
+
+    def at_lowest(one: JointFrequencyResponse) -> Estimate:
+        return Estimate(one.gain[0], one.gain_ci95[0])
+
+    def agree(one: JointFrequencyResponse) -> str | None:
+        return None if one.halves_agree is None else "{} of {}".format(*one.halves_agree)
+
+    def model(one: JointFrequencyResponse) -> str:
+        return "group delay" if one.delay_model is None else "model {}/{}".format(*one.delay_model)
+
+    def excitation(one: JointFrequencyResponse) -> str:
+        return one.excitation if one.method == DIRECT else f"{one.excitation}, {one.method}"
+
+    def distortion(one: JointFrequencyResponse) -> Estimate:
+        return scaled(Estimate(one.distortion), 100.0)
+
+    columns: list[Column[JointFrequencyResponse]] = [
+        Column("joint", "joint", lambda one: one.joint, kind="word"),
+        Column("command", "command", excitation, kind="word", spare=2),
+        Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
+        Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
+        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, typical(4, 4)),
+        Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
+        Column(
+            "delay ms (95 %)", "delay [ms]", lambda one: scaled(one.delay_s, 1e3), typical(2, 3)
+        ),
+        Column("is", "delay is", model, kind="word", spare=4),
+        Column("distortion %", "distortion [%]", distortion, (2, 2), spare=3),
+        Column("halves agree", "halves agree", agree, kind="word", spare=1),
+    ]
+    about = {
+        "delay [ms]": "with the offset of the clocks",
+        "distortion [%]": "nonlinear, of the response; a dash where it can't be separated from "
+        "noise",
+    }
+    return Table(columns, found, about=about)
+
+
+def tracking_table(joints: Sequence[JointTracking]) -> Table[JointTracking]:
+    """Return gain, lag and offset by joint."""
+
+    def model(joint: JointTracking) -> str:
+        poles = ("delay", "delay and a pole", "delay and two poles")[joint.poles]
+        return f"{poles}, held" if joint.held else poles
+
+    columns: list[Column[JointTracking]] = [
+        Column("joint", "joint", lambda joint: joint.joint, kind="word"),
+        Column("gain (95 %)", "gain [1]", lambda joint: joint.gain, typical(2, 4)),
+        Column("lag ms (95 %)", "lag [ms]", lambda joint: scaled(joint.lag_s, 1e3), typical(2, 3)),
+        Column(
+            "offset deg (95 %)",
+            "offset [deg]",
+            lambda joint: degrees(joint.offset_rad),
+            typical(2, 3),
+        ),
+        Column("model", "model", model, kind="word", spare=3),
+        Column(
+            "explained %", "explained [%]", lambda joint: 100 * joint.explained, (1, 2), spare=2
+        ),
+    ]
+    about = {
+        "gain [1]": "of slow motion, response over command",
+        "lag [ms]": "of slow motion: delay and time constants, with the offset of the clocks",
+        "offset [deg]": "mean of the position less that of the delayed command",
+        "model": "what explains the motion; held: each command holds until the next",
+    }
+    return Table(columns, joints, about=about)
+
+
+def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
+    """Return amplitude, offset and lag of joints that move without commands."""
+    with_planes = any(one.plane for one in found)
+    angle, lag = typical(2, 4), "lag behind the one before"
+    columns: list[Column[JointMotion]] = [
+        Column("joint", "joint", lambda one: one.name, kind="word"),
+        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
+        Column("amplitude° (95 %)", "amplitude [°]", lambda one: degrees(one.amplitude_rad), angle),
+        Column("offset° (95 %)", "offset [°]", lambda one: degrees(one.offset_rad), angle, spare=1),
+        Column(f"{lag}° (95 %)", f"{lag} [°]", lambda one: degrees(one.lag_rad), angle),
+    ]
+    return Table(columns, found)
+
+
+def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
+    """Return the waves along the body, one a plane."""
+
+    def way(one: BodyWave) -> str:
+        first, last = one.joints[0], one.joints[-1]
+        if one.direction == "undecided":
+            return f"undecided, {first} and {last}"
+        return f"{first} to {last}" if one.direction == "first-to-last" else f"{last} to {first}"
+
+    def off(one: BodyWave) -> float:
+        return math.degrees(one.deviation_rad)
+
+    with_planes = any(one.plane for one in found)
+    angle, share = typical(2, 4), typical(3, 4)
+    columns: list[Column[BodyWave]] = [
+        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
+        Column("wave", "wave", way, kind="word"),
+        Column(
+            "°/joint (95 %)", "wave number [°/joint]", lambda one: degrees(one.wave_number), angle
+        ),
+        Column("waves (95 %)", "waves", lambda one: one.waves, share),
+        Column("joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, typical(2, 3)),
+        Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, share, spare=1),
+        Column(
+            "travelling (95 %)", "travelling index [1]", lambda one: one.travelling_index, share
+        ),
+        Column("off the line°", "off the line [°]", off, (1, 2), spare=2),
+    ]
+    about = {
+        "wave number [°/joint]": "lag from joint to joint, of a line through the phases",
+        "travelling index [1]": "1 of a travelling, 0 of a standing wave",
+        "off the line [°]": "root mean square of the phases about the line",
+    }
+    return Table(columns, found, about=about)
