@@ -102,12 +102,13 @@ def excited_bins(spectrum: FloatArray) -> IntArray:
         Of the powers, each the mean over five bins, the largest that together have the share
         :data:`ENERGY`; ascending.
     """
-    smooth = np.convolve(spectrum, np.ones(_SMOOTHING) / _SMOOTHING, mode="same")
+    smooth: FloatArray = np.convolve(spectrum, np.ones(_SMOOTHING) / _SMOOTHING, mode="same")
     smooth[:1] = 0.0
-    order = np.argsort(smooth)[::-1]
+    order: IntArray = np.argsort(smooth)[::-1].astype(np.int64)
     share: FloatArray = np.cumsum(smooth[order])
-    count = int(np.searchsorted(share, ENERGY * share[-1])) + 1
-    return np.sort(order[:count]) if share[-1] > 0 else order[:0]
+    total = float(share[-1])
+    count = int(np.searchsorted(share, ENERGY * total)) + 1
+    return np.sort(order[:count]) if total > 0 else order[:0]
 
 
 def swept_band(values: FloatArray, step_s: float) -> tuple[float, float] | None:

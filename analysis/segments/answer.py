@@ -276,7 +276,7 @@ def _tracked(why: str, tracking: Sequence[JointTracking]) -> str:
     if not follow:
         return ""
     gains = _range([joint.gain.value or 0.0 for joint in follow])
-    lags = _range([1e3 * (joint.lag_s.value or 0.0) for joint in follow])
+    lags = _range([round(1e3 * (joint.lag_s.value or 0.0)) for joint in follow], "d")
     joints = f"{len(follow)} joint{'s follow' if len(follow) > 1 else ' follows'}"
     return f"{why}: {joints} with a gain of {gains} and a lag of {lags} ms."
 
@@ -327,8 +327,8 @@ def _swept(found: Sequence[JointFrequencyResponse], tracking: Sequence[JointTrac
     return text + (". All joints share one command: it is the response to that." if shared else ".")
 
 
-def _range(values: Sequence[float]) -> str:
-    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+def _range(values: Sequence[float], digits: str = ".3g") -> str:
+    low, high = f"{min(values):{digits}}", f"{max(values):{digits}}"
     return low if low == high else f"{low} to {high}"
 
 
