@@ -53,11 +53,13 @@ class ResponseErrors:
             and that no two joints share, shape (m, 2, 2).
         turn: Lag error that one standard error of the shared frequency makes [rad], shape (m,);
             it is the same error in all joints.
+        steps: Variances of ln|H| and arg H by rounding to steps alone, shape (m, 2); None for zero.
     """
 
     bins: ComplexArray
     rounding: FloatArray
     turn: FloatArray
+    steps: FloatArray | None = None
 
     def select(self, chosen: Sequence[int] | IntArray) -> ResponseErrors:
         """Some of the joints.
@@ -66,7 +68,8 @@ class ResponseErrors:
             chosen: Indices, k of them.
         """
         index = np.asarray(chosen, dtype=np.int64)
-        return ResponseErrors(self.bins[index], self.rounding[index], self.turn[index])
+        steps = None if self.steps is None else self.steps[index]
+        return ResponseErrors(self.bins[index], self.rounding[index], self.turn[index], steps)
 
 
 def response_errors(
@@ -91,7 +94,7 @@ def response_errors(
         The errors; NaN for a joint whose command or response is zero.
     """
     parts: list[ComplexArray] = []
-    rounding = np.zeros((response.size, 2, 2))
+    rounding, steps = np.zeros((2, response.size, 2, 2))
     for amplitude, found in ((response, response_bins), (command, command_bins)):
         known = np.abs(amplitude) > 0
         inverse = np.full(amplitude.shape, np.nan, dtype=np.complex128)
@@ -101,8 +104,11 @@ def response_errors(
         turned = np.stack([inverse, 1j * inverse], axis=1)
         turned = np.stack([turned.real, turned.imag], axis=1)
         rounding += turned @ found.rounding @ turned.transpose(0, 2, 1)
+        if found.steps is not None:
+            steps += turned @ found.steps @ turned.transpose(0, 2, 1)
     turn = np.zeros(response.size) + omega_variance**0.5 * np.asarray(delay_between_s)
-    return ResponseErrors(parts[0] - parts[1], rounding, turn)
+    alone = np.einsum("mii->mi", steps)
+    return ResponseErrors(parts[0] - parts[1], rounding, turn, alone)
 
 
 EQUIVALENT_GAIN = 0.02

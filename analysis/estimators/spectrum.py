@@ -101,12 +101,14 @@ class ResidualBins:
             of ``spread |value|^2`` is E|error of a|^2.
         rounding: Covariance of (Re a, Im a) that rounding, to steps or of numbers, adds to what
             the bins show, shape (K, 2, 2); it is counted as each channel's own.
+        steps: The same by rounding to steps alone, whatever the bins show; None for zero.
     """
 
     values: ComplexArray
     offset: FloatArray
     spread: FloatArray
     rounding: FloatArray
+    steps: FloatArray | None = None
 
     def select(self, chosen: Sequence[int] | IntArray) -> ResidualBins:
         """Some of the channels.
@@ -115,9 +117,9 @@ class ResidualBins:
             chosen: Indices, k of them; an index may come more than once.
         """
         index = np.asarray(chosen, dtype=np.int64)
-        return ResidualBins(
-            self.values[index], self.offset, self.spread[index], self.rounding[index]
-        )
+        steps = None if self.steps is None else self.steps[index]
+        chosen_rows = (self.spread[index], self.rounding[index], steps)
+        return ResidualBins(self.values[index], self.offset, *chosen_rows)
 
 
 def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
@@ -174,7 +176,9 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     spread = np.trace(block, axis1=1, axis2=2)
     covariance = level[:, None, None] * block
     rounding = floor[:, None, None] * block
+    steps = np.zeros_like(rounding)
     for k, rounded in _rounded(series, fit, level):
+        steps[k] = rounded
         if np.trace(rounded) > RAISED * spread[k] * level[k]:
             more = not_negative(rounded - covariance[k])
             rounding[k] += more
@@ -182,7 +186,8 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
             level[k] = np.trace(covariance[k]) / spread[k]
             dof[k] = draws(series[k].count)
     common = [common for common, _ in found]
-    return (Noise(level, dof, covariance), _common_bins(groups, common, shortest, spread, rounding))
+    bins = _common_bins(groups, common, shortest, spread, rounding)
+    return Noise(level, dof, covariance), replace(bins, steps=steps)
 
 
 def _rounded(

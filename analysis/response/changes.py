@@ -207,6 +207,9 @@ def with_changes(response: Response, changes: ResponseChanges) -> Response:
         before = known * (np.array([t_factor(each) for each in response.dof]) / factor) ** 2
         own = np.maximum(own, before) if found.alike else own
         relative = response.ratio / changes.reference
+    if response.errors is not None and response.errors.steps is not None:
+        # Rounding repeats with the samples' phases: it isn't what cycles vary by.
+        own = np.maximum(own, response.errors.steps.T)
     half = found.residuals.reshape(*shape, found.residuals.shape[1])
     bins = np.sqrt(found.share[0]) * half[0] + 1j * np.sqrt(found.share[1]) * half[1]
     circular = np.mean(np.abs(bins) ** 2, axis=1) / 2

@@ -144,10 +144,12 @@ def test_errors_of_a_logarithm_are_relative_errors():
     # Divided by j, an error of the real part turns the response, one of the imaginary enlarges it.
     np.testing.assert_allclose(found.rounding[0], np.diag([0.01, 0.04]), atol=1e-15)
     np.testing.assert_allclose(found.rounding[1], np.diag([0.01, 0.0025]), atol=1e-15)
+    np.testing.assert_allclose(found.steps[0], [0.02, 0.08], atol=1e-15)
     np.testing.assert_allclose(found.turn, [0.0, 0.5, 1.0])
     some = found.select([2, 0])
     np.testing.assert_array_equal(some.turn, [1.0, 0.0])
     np.testing.assert_array_equal(some.bins[1], found.bins[0])
+    np.testing.assert_array_equal(some.steps[1], found.steps[0])
     np.testing.assert_array_equal(some.rounding[1], found.rounding[0])
     with pytest.raises(dataclasses.FrozenInstanceError):
         some.turn = None
@@ -156,7 +158,7 @@ def test_errors_of_a_logarithm_are_relative_errors():
 
 def _bins(values, spread, rounding):
     """Fields of :class:`ResidualBins`; those that these errors don't need stay empty."""
-    given = {"values": values, "spread": spread, "rounding": rounding}
+    given = {"values": values, "spread": spread, "rounding": rounding, "steps": 2 * rounding}
     names = [one.name for one in dataclasses.fields(ResidualBins)]
     return {name: given.get(name, np.zeros(3)) for name in names}
 

@@ -285,3 +285,25 @@ def test_exact_signals_and_few_cycles_have_no_trend():
     four = {name: one.between(0.0, 4.0) for name, one in late.items()}
     gait = fit_gait({"q": exact["q"].between(0.0, 4.0)}, four, 4.0, notes.append)
     assert gait.changes is None
+
+
+@pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(25, 0.4), (125, 0.8)])
+def test_rounding_that_repeats_over_two_cycles_stays_in_the_interval(rate_hz, frequency_hz):
+    """An odd number of samples in two cycles, whose errors cancel from one cycle to the next.
+
+    12 bits without noise; of 20 joints at 95 % 17 at least, with a probability of 98 %.
+    """
+    step, t = 2 * np.pi / 4096, np.arange(0.0, 30.0, 1 / rate_hz)
+    held = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        swing, gain, lag = rng.uniform(0.1, 0.7), rng.uniform(0.7, 1.1), rng.uniform(0.1, 1.0)
+        angle = 2 * np.pi * frequency_hz * t + rng.uniform(0, 2 * np.pi)
+        command = swing * np.sin(angle)
+        position = step * np.rint(gain * swing * np.sin(angle - lag) / step)
+        fit = fit_gait(
+            {"j": Series("j", t, command)}, {"j": Series("j", t, position)}, 30.0, lambda _: None
+        )
+        half = 2.01 * np.sqrt(fit.response.lag_variance[0])  # Student's of 48 degrees of freedom
+        held += abs(fit.response.lag_rad[0] - lag) <= half
+    assert held >= 17
