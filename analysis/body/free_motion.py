@@ -127,8 +127,8 @@ class PhaseLine:
     """A line through the phases of m joints.
 
     Attributes:
-        slope: kappa [rad/unit of the places].
-        error: Its standard error.
+        slope: kappa [rad/unit of the places]; its interval holds how far the phases are off a line.
+        error: Its standard error by noise.
         deviation_rad: Root mean square of the phases about it, weighted.
         phases_rad: The phases, unwrapped along the chain, shape (m,).
     """
@@ -166,8 +166,31 @@ def phase_line(
     # d kappa = contrast (Im(da / a) + 2 left Re(da / a)): amplitudes are the weights.
     noise = motion.error(contrast * (2 * left - 1j) / motion.amplitudes)
     error = float(np.hypot(noise, motion.turn(contrast)))
-    interval = around(slope, t_factor(motion.dof) * error)
+    half = float(
+        np.hypot(t_factor(motion.dof) * error, _misfit(contrast * left, noise, motion.dof))
+    )
+    interval = around(slope, half)
     return PhaseLine(Estimate(slope, interval), error, float(weight @ left**2) ** 0.5, phase)
+
+
+def _misfit(shares: FloatArray, noise: float, dof: float) -> float:
+    """Return what phases off the line add to half of the slope's interval.
+
+    Args:
+        shares: What each phase's distance from the line adds to the slope, shape (m,).
+        noise: Standard error of the slope by noise.
+        dof: Its degrees of freedom.
+
+    Returns:
+        0 where the noise explains them, by an F test.
+    """
+    freedom = shares.size - 2
+    if freedom < 1:
+        return 0.0
+    variance = float(shares @ shares) * shares.size / freedom
+    if variance <= noise**2 * float(fdtri(freedom, dof, CONFIDENCE)):
+        return 0.0
+    return t_factor(float(freedom)) * (variance - noise**2) ** 0.5
 
 
 def best_lag(phase: FloatArray, index: FloatArray, weight: FloatArray) -> float:

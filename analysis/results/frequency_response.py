@@ -195,11 +195,20 @@ class BodyWave:
 
     @property
     def direction(self) -> str:
-        """``first-to-last``, ``last-to-first``, or ``undecided``, by the interval."""
+        """``first-to-last``, ``last-to-first``, or ``undecided``, by the intervals.
+
+        Of a standing wave, whose travelling index can't be told from 0, noise draws the direction.
+        """
         ci95 = self.wave_number.ci95
-        if ci95 is None or ci95[0] <= 0 <= ci95[1]:
+        if self.standing or ci95 is None or ci95[0] <= 0 <= ci95[1]:
             return "undecided"
         return "first-to-last" if ci95[0] > 0 else "last-to-first"
+
+    @property
+    def standing(self) -> bool:
+        """Whether nothing of the wave is shown to travel."""
+        ci95 = self.travelling_index.ci95
+        return ci95 is not None and ci95[0] <= 0
 
 
 @dataclass(frozen=True)

@@ -287,7 +287,7 @@ def _motion(facts: Facts, motion: FreeMotion) -> str:
         return "No command logged, and no single frequency in the motion."
     gait = formats.gait_frequency(facts.gait)
     lead = f"No command logged; the motion has {gait} and an amplitude"
-    whole = [one for one in motion.waves if one.direction != "undecided"]
+    whole = [wave for wave in motion.waves if wave.standing or wave.direction != "undecided"]
     if not whole or len(motion.joints) <= NAMED:
         sizes = [
             f"{plain(one.name)} {formats.estimate(formats.degrees(one.amplitude_rad), '°')}"
@@ -307,6 +307,8 @@ def _wave(wave: BodyWave) -> str:
         first, last = last, first
     plane = "" if wave.plane is None else f"{wave.plane} "
     index = formats.estimate(wave.travelling_index)
+    if wave.standing:
+        return f"the {plane}wave stands, as far as noise shows (travelling index {index})"
     return (
         f"a {plane}wave runs from {plain(first)} to {plain(last)}, "
         f"{formats.estimate(wave.waves)} wavelengths between them, travelling index {index}"

@@ -101,7 +101,31 @@ def test_a_standing_wave_has_no_direction_and_an_interval_to_zero():
         (wave,) = measured(chain(sizes + 0j, noise=NOISE, seed=seed))[1].waves
         to_zero += wave.travelling_index.ci95[0] == 0.0
         assert wave.travelling_index.value < 0.05
+        assert wave.standing is (wave.travelling_index.ci95[0] == 0.0)
+        assert wave.direction == "undecided" or not wave.standing
     assert to_zero >= 34  # 95 % of 40 within binomial scatter
+
+
+def test_a_standing_wave_has_no_direction():
+    """0.6 rad from joint to joint: noise alone would draw one."""
+    sizes = 0.4 * np.cos(0.6 * np.arange(10) + 1.0)
+    (wave,) = measured(chain(sizes + 0j, seconds=20.0, noise=0.003))[1].waves
+    assert wave.standing
+    assert wave.direction == "undecided"
+
+
+def test_a_wave_number_holds_how_far_phases_are_off_a_line():
+    """A wavelength that shortens along the body: each half's own slope is in the interval."""
+    steps = np.linspace(0.4, 0.9, 9)
+    amplitudes = 0.3 * np.exp(-1j * np.concatenate(([0.0], np.cumsum(steps))))
+    (wave,) = measured(chain(amplitudes, noise=NOISE))[1].waves
+    low, high = wave.wave_number.ci95
+    assert wave.wave_number.value == pytest.approx(steps.mean(), abs=0.02)
+    assert high - low > 0.1
+    (straight,) = measured(chain(0.3 * np.exp(-0.65j * np.arange(10)), noise=NOISE))[1].waves
+    low, high = straight.wave_number.ci95
+    assert high - low < 0.01
+    assert wave.direction == straight.direction == "first-to-last"
 
 
 def test_a_joint_at_rest_has_no_phase_and_the_wave_goes_on_behind_it():
@@ -128,7 +152,7 @@ def test_a_constant_joint_keeps_its_place_in_the_chain():
 @pytest.mark.parametrize("seconds", [8.0, 20.0, 60.0])
 def test_intervals_hold_the_truth_and_are_no_wider_than_the_bound(seconds):
     """95 % of 200 draws within binomial scatter (91 to 98 %), width over the Cramer-Rao bound's."""
-    steps = np.array([0.9, 0.5, 0.6, 1.1, 0.7])  # no straight line
+    steps = np.full(5, 0.76)  # a straight line: what is off it has a test of its own
     sizes = np.array([0.2, 0.25, 0.3, 0.25, 0.3, 0.4])
     amplitudes = sizes * np.exp(-1j * np.concatenate(([0.0], np.cumsum(steps))))
     truth = measured(chain(amplitudes, seconds))[1]
