@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +12,8 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import NS, FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.common.errors import DataError, MissingChannelError
+from undulog.capture.common.errors import DataError, MissingChannelError, some_names
+from undulog.capture.judgement.naming import NAMED
 from undulog.capture.judgement.publishers import are_of_two_nodes
 from undulog.capture.judgement.session import in_turn
 from undulog.capture.log.messages.definitions import PowerTopic
@@ -189,12 +191,30 @@ def read_columns(
     _leave_out_pauses(by_name, response_topic, session.start_ns, warn)
     absent: dict[str, Signal] = {}
     return Columns(
-        names=tuple(seen),
+        names=tuple(seen) if session.robot is not None else by_number(tuple(seen), warn),
         **{key: by_name.get(key, absent) for key in QUANTITIES},
         powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
         topics={key: wanted[key][0] for key in found},
         excitation=by_name.get("excitation", absent),
     )
+
+
+def by_number(names: tuple[str, ...], warn: Warn) -> tuple[str, ...]:
+    """Return joints in the order of their numbers, where the file has them sorted as text.
+
+    As text ``joint_10`` comes before ``joint_2``, and no wave runs along such a chain.
+    """
+    ordered = tuple(sorted(names, key=_parts))
+    if names == ordered or list(names) != sorted(names):
+        return names
+    warn(Note(f"joints are taken in the order of their numbers: {some_names(ordered, NAMED)}"))
+    return ordered
+
+
+def _parts(name: str) -> tuple[tuple[str, int], ...]:
+    """Return a name's letters, each with the number that follows."""
+    parts = re.findall(r"(\D*)(\d*)", name)
+    return tuple((letters, int(digits or -1)) for letters, digits in parts)
 
 
 def _leave_out_pauses(
