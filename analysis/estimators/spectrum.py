@@ -18,6 +18,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.process import in_threads
+from undulog.capture.judgement.levels import ROBUST, TAME
 
 from .harmonic import RELATIVE_FLOOR, HarmonicFit, HarmonicModel, basis, chunks, time_scale
 from .quantisation import (
@@ -34,6 +35,12 @@ BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""
 
 _BLOCKS = 4096
+
+_LOOKED_AT = 4096
+"""Samples by which the course of noise over a cycle is known to 5 %."""
+
+_LARGEST = (TAME * ROBUST) ** 2
+"""Largest square of a residual, in median ones."""
 
 RAISED = 1.3
 """Rounding that alone makes this many times the noise found beside omega counts instead of it."""
@@ -174,7 +181,11 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     first = fit.model.first
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
     spread = np.trace(block, axis1=1, axis2=2)
+    noisy = np.flatnonzero(floor == 0).tolist()
+    shapes = in_threads(lambda k: _modulated(series[k], fit, k), noisy, _LOOKED_AT * len(noisy))
     covariance = level[:, None, None] * block
+    for k, shape in zip(noisy, shapes, strict=True):
+        covariance[k] = level[k] * shape
     rounding = floor[:, None, None] * block
     steps = np.zeros_like(rounding)
     for k, rounded in _rounded(series, fit, level):
@@ -188,6 +199,30 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     common = [common for common, _ in found]
     bins = _common_bins(groups, common, shortest, spread, rounding)
     return Noise(level, dof, covariance), replace(bins, steps=steps)
+
+
+def _modulated(channel: Series, fit: HarmonicFit, k: int) -> FloatArray:
+    """Return the covariance of (Re a, Im a) for a noise level of one, shape (2, 2).
+
+    Noise that grows with the motion is strongest where cos^2 is, and moves the amplitude more than
+    the phase: each sample counts by its own square (White, Econometrica 48, 1980, doi
+    10.2307/1912934). Squares are limited, so that a few samples of heavy tails don't decide it.
+    """
+    first = fit.model.first
+    weight = fit.inverse_gram[k][first : first + 2]
+    block: FloatArray = weight[:, first : first + 2]
+    t_s, values = channel.t_s, channel.values
+    if channel.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
+        index = np.sort(np.random.default_rng(0).choice(channel.count, _LOOKED_AT, replace=False))
+        t_s, values = t_s[index], values[index]
+    scale = time_scale(channel.t_s)
+    rows = basis(t_s, fit.omega, fit.model, scale)
+    squares = (values - fit.parameters([k], scale)[0] @ rows) ** 2
+    squares = np.minimum(squares, _LARGEST * float(np.median(squares)))
+    parts = weight @ rows
+    shape: FloatArray = (parts * squares) @ parts.T
+    size = float(np.trace(shape))
+    return shape * (float(np.trace(block)) / size) if size > 0 else block
 
 
 def _rounded(

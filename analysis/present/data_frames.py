@@ -35,6 +35,7 @@ from ..results.coupling import (
 )
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
+from ..results.frequency_response import JointTracking
 from ..results.oscillators import ChainCoupling, Link, Mode, Rate
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
@@ -145,6 +146,8 @@ def _of_analysis(result: Analysis) -> Frames:
         "heterogeneity": named(Index, result.heterogeneity),
         "gait": pd.DataFrame([row_of(result.gait)]),
     }
+    if result.tracking:
+        frames["tracking"] = table(JointTracking, result.tracking)
     if result.body is not None:
         models = {"measured": result.body.observed} | result.body.null
         names = [model for model, points in models.items() for _ in points]

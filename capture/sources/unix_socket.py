@@ -73,6 +73,7 @@ class _Sender:
     receiver: ReceiveThread
     floor_ns: int
     last_ns: int
+    empty: int = 0  # packets since the last one with bytes: beyond its end, all reads are empty
     expected: int | None = None
     dropped: int = 0
     active: bool = False
@@ -281,14 +282,15 @@ class UnixSource:
         arrivals: list[int] = []
         counts: list[int] = []
         malformed = 0
-        empty = 0  # beyond a sender's last packet, reads are empty
         for row, (size, time_ns) in enumerate(zip(batch.sizes, times, strict=True)):
             shape = _SHAPES.get(size)  # one that is too long is cut to a size that isn't there
-            if shape is None:
-                malformed += empty + 1 if size else 0
-                empty = 0 if size else empty + 1
+            if not size:
+                sender.empty += 1
                 continue
-            malformed, empty = malformed + empty, 0
+            malformed += sender.empty + (shape is None)
+            sender.empty = 0
+            if shape is None:
+                continue
             count, head = shape
             start = row * width
             if head:

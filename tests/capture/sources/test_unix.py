@@ -165,6 +165,20 @@ def test_malformed_packets_are_counted_and_reported(reader, peer):
     assert reader.source.connected
 
 
+def test_an_empty_packet_is_counted_whenever_the_next_one_comes(reader, peer):
+    """Beyond a sender's end all reads are empty: only a packet after it shows that it was one."""
+    truth = traffic(2)
+    sock = peer()
+    sock.send(truth[:1].tobytes())
+    sock.send(b"")
+    assert same(reader.until_frames(1), truth[:1])
+    reader.until(lambda: reader.source._senders[0].empty == 1)
+    assert reader.counts.malformed == 0
+    sock.send(truth[1:].tobytes())
+    assert same(reader.until_frames(2)[-1:], truth[1:])
+    assert reader.counts.malformed == 1
+
+
 def test_arrival_is_when_it_came_not_when_it_was_fetched(reader, peer, context):
     sock = peer()
     reader.until_event("connected")
