@@ -24,6 +24,7 @@ from undulog.analysis.results.frequency_response import (
     BodyWave,
     JointFrequencyResponse,
     JointMotion,
+    JointTracking,
 )
 
 VERSION = 1
@@ -46,6 +47,7 @@ _FLAT = frozenset(
         BodyTravel,
         BodyWave,
         JointFrequencyResponse,
+        JointTracking,
         JointMotion,
         LinkContact,
         Serpenoid,

@@ -83,6 +83,8 @@ class QueryProcess:
         with self._lock:
             # Names of servers and keys may have changed since the last one.
             answer = self._ask(pickle.dumps((where, query, dict(os.environ))))
+            if isinstance(answer, Refused) and TOO_LARGE in answer.text:
+                self._end()  # it may not return the memory that it has taken
         if isinstance(answer, Refused):
             raise answer.error()
         return answer
