@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ...estimators.series import Series
 from .errors import FEWEST
@@ -42,6 +42,9 @@ explains the data a hundred times better (the ratio of two likelihoods)."""
 
 POSSIBLE = 3.84
 """The same from which a further pole is possible at all: the 95th percentile of chi-squared."""
+
+MOST_SAMPLES = 1 << 16
+"""Samples that are fitted, evenly thinned out: those of an hour at 18 Hz."""
 
 MOST_POLES = 2
 
@@ -113,7 +116,8 @@ def track(command: Series, position: Series, used: BoolArray | None = None) -> T
     within = within if used is None else within & used
     if np.count_nonzero(within) < 2 * FEWEST or not np.ptp(position.values[within]) > 0:
         return None
-    data = Data(command, position, within)
+    chosen: IntArray = np.flatnonzero(within).astype(np.int64)
+    data = Data(command, position, chosen[:: -(-chosen.size // MOST_SAMPLES)])
     return _combined(data, _fits(data))
 
 

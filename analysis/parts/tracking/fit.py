@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
 from ...estimators.series import Series
 from .command import Command
@@ -81,8 +81,8 @@ class Fit:
 class Data:
     """Command and position of one joint."""
 
-    def __init__(self, command: Series, position: Series, used: BoolArray) -> None:
-        """Take the samples of the position that are used, shape (n,)."""
+    def __init__(self, command: Series, position: Series, used: IntArray) -> None:
+        """Take the samples of the position with these indices, shape (n,)."""
         self.t_s, self.y = position.t_s[used], position.values[used]
         self.period_s = command.period_s
         self._commands = [Command(command, position, held=held) for held in (False, True)]

@@ -141,6 +141,15 @@ def test_a_joint_that_stands_and_one_that_is_not_asked_have_none():
     assert track(command, position.between(0.0, 0.15)) is None
 
 
+def test_a_long_record_is_thinned_out():
+    """Half an hour at 200 Hz: every sixth sample, and the answer of a shorter one."""
+    found = track(*late(0.09, position_hz=200.0, noise=5e-3, length_s=1800.0))
+    short = track(*late(0.09, position_hz=200.0, noise=5e-3, length_s=60.0))
+    assert found.lag_s.ci95[0] <= 0.09 <= found.lag_s.ci95[1]
+    width, shorter = (x.lag_s.ci95[1] - x.lag_s.ci95[0] for x in (found, short))
+    assert width < shorter / 1.5
+
+
 def test_errors_of_a_mean_are_those_of_correlated_noise():
     """The mean of an AR(1) series of n samples has the variance (1 + r) / (1 - r) / n of one."""
     rng, n, r = np.random.default_rng(1), 4000, 0.9
