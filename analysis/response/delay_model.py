@@ -198,6 +198,8 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
                 best = cost, start
         if best is None:
             return None
+        if best[0] <= _HOPELESS * 2 * lines.s.size:
+            break
         # Precise lines take a start within what their noise allows.
         delays = best[1][0] + step * np.arange(1 - _FINER, _FINER) / _FINER
         step /= _FINER

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.judgement.shifts import rank_correlation
 
 from ..estimators.series import Series, moves
 from .nonparametric import find_tones, resampled
@@ -186,10 +187,7 @@ def _exact_lag(curve: CubicSpline, lag: float) -> tuple[float, float]:
 
 def _is_chirp(values: FloatArray) -> bool:
     """Whether the instantaneous frequency rises or falls all the time."""
-    from scipy.stats import spearmanr
-
     crossings = np.flatnonzero(np.diff(np.signbit(values)))
     if crossings.size < 8:
         return False
-    found = spearmanr(np.arange(crossings.size - 1), np.diff(crossings))
-    return abs(float(found.statistic)) > _SWEPT
+    return abs(rank_correlation(np.diff(crossings).astype(np.float64))) > _SWEPT
