@@ -157,10 +157,11 @@ def _bends(data: Data, fit: Fit) -> bool:
     d = float(fit.theta[D])
     wide = max(data.period_s, d / 2)
     middle, early, late = (data.x(fit.held, d + way * wide, 0.0, 0.0) for way in (0, -1, 1))
-    bent, design = early + late - 2 * middle, slopes(data, fit)
+    design, left = slopes(data, fit)
+    bent = early + late - 2 * middle
     bent = bent - design @ np.linalg.lstsq(design, bent, rcond=None)[0]
     power = float(bent @ bent)
-    along = float(bent @ data.residual(fit))
+    along = float(bent @ left)
     return power > 0 and along**2 / power > POSSIBLE * data.unit(fit)
 
 

@@ -101,11 +101,6 @@ class Data:
         left = y - gain * moved
         return np.array([level - middle, gain, d, a, q]), float(left @ left)
 
-    def residual(self, fit: Fit) -> FloatArray:
-        """Return what a fit leaves, shape (n,) [rad]."""
-        x = self.x(fit.held, *fit.theta[D:].tolist())
-        return self.y - self.y.mean() - fit.theta[GAIN] * (x - x.mean())
-
     def unit(self, fit: Fit) -> float:
         """Return the variance of a residual, times what correlation makes of the lag's [rad^2]."""
         inflation = 1.0 if fit.errors is None else float(fit.errors.inflation[D])
@@ -146,40 +141,45 @@ def with_errors(data: Data, fit: Fit) -> Fit:
     """Add the standard errors."""
     if fit.errors is not None:
         return fit
-    design = slopes(data, fit)
+    design, left = slopes(data, fit)
     chosen = np.zeros((5, design.shape[1]))
     np.fill_diagonal(chosen, 1.0)
     if fit.order:
         chosen[D, A] = 1.0
-    return replace(fit, errors=errors_of(data.t_s, design, data.residual(fit), chosen))
+    return replace(fit, errors=errors_of(data.t_s, design, left, chosen))
 
 
-def slopes(data: Data, fit: Fit) -> FloatArray:
+def slopes(data: Data, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of equation (1) by offset, g, d, and a and q as far as it has poles.
 
     Returns:
-        Shape (n, 3 + order).
+        Derivatives, shape (n, 3 + order), and what the fit leaves [rad], shape (n,).
     """
     _, gain, d, a, q = fit.theta.tolist()
     x = data.x(fit.held, d, a, q)
     # A staircase has the slope that it has over its steps.
-    step = data.period_s / 2 if fit.held and not fit.order else DIFFERENCE
-    rate = data.x(fit.held, d + step, a, q) - data.x(fit.held, d - step, a, q)
-    columns = [np.ones(x.size), x - x.mean(), gain * rate / (2 * step)]
+    if fit.held and not fit.order:
+        step = data.period_s
+        rate = data.x(True, d + step / 2, 0.0, 0.0) - data.x(True, d - step / 2, 0.0, 0.0)
+    else:
+        step = DIFFERENCE
+        rate = data.x(fit.held, d + step, a, q) - x
+    moved = x - x.mean()
+    columns = [np.ones(x.size), moved, gain * rate / step]
     if fit.order:
         columns.append(gain * (data.x(fit.held, d, a + DIFFERENCE, q) - x) / DIFFERENCE)
     if fit.order > 1:
         step = max(q, DIFFERENCE) * DIFFERENCE**0.5
         columns.append(gain * (data.x(fit.held, d, a, q + step) - x) / step)
-    return np.stack(columns, axis=1)
+    return np.stack(columns, axis=1), data.y - data.y.mean() - gain * moved
 
 
 def _improved(data: Data, fit: Fit) -> Fit:
     """Take steps of Gauss and Newton until they reduce the squares no more."""
     for _ in range(STEPS):
-        design = slopes(data, fit)
+        design, left = slopes(data, fit)
         step = np.zeros(5)
-        step[: design.shape[1]] = np.linalg.lstsq(design, data.residual(fit), rcond=None)[0]
+        step[: design.shape[1]] = np.linalg.lstsq(design, left, rcond=None)[0]
         better = _moved(data, fit, step)
         if better is None:
             break
