@@ -190,11 +190,11 @@ def _of_band(
 
 
 def _usable_bins(spectrum: ComplexArray, values: FloatArray, step: float, half: int) -> IntArray:
-    """Return the bins at which a response can be told.
+    """Return the bins at which a response can be estimated.
 
     Those of the command's energy, within the frequencies of a sweep, below a quarter of the
     sampling rate, and with as many such bins in their window as it has unknowns: fewer would be
-    told from what leaks beside them.
+    estimated from what leaks beside them.
     """
     bins = excited_bins(np.abs(spectrum) ** 2)
     if (band := swept_band(values, step)) is not None:

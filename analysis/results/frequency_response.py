@@ -197,7 +197,7 @@ class BodyWave:
     def direction(self) -> str:
         """``first-to-last``, ``last-to-first``, or ``undecided``, by the intervals.
 
-        Of a standing wave, whose travelling index can't be told from 0, noise draws the direction.
+        Of a standing wave, whose travelling index isn't distinct from 0, noise draws the direction.
         """
         ci95 = self.wave_number.ci95
         if self.standing or ci95 is None or ci95[0] <= 0 <= ci95[1]:

@@ -48,7 +48,7 @@ def unlike(
         Those that stand out by more than the margins, of each group those furthest out first:
         the gain relative to the others' mean, the delay in seconds, the offset in rad.
     """
-    responding = {name for name, tracking in trackings.items() if responds(tracking)}
+    responding = {name for name, tracking in trackings.items() if _responds(tracking)}
     compared = [[name for name in group if name in responding] for group in groups]
     tests = sum(map(len, compared)) * len(QUANTITIES)
     return tuple(
@@ -59,7 +59,7 @@ def unlike(
     )
 
 
-def responds(tracking: Tracking) -> bool:
+def _responds(tracking: Tracking) -> bool:
     """Return whether a joint follows at all, with an error that is known."""
     enough = tracking.explained >= HALF and tracking.gain.value >= QUARTER
     return enough and tracking.gain.ci95 is not None

@@ -13,12 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri
 
 from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.judgement.levels import FEWEST
 
-FEWEST, MOST = 8, 64
-"""Blocks: with fewer an error isn't known; with more Student's quantile falls by less than 2 %."""
+from ...estimators.intervals import t_factor
+
+MOST = 64
+"""Blocks at most: with more, Student's quantile falls by less than 2 %."""
 
 TAPER = 4
 """Correlation times after which an autocorrelation counts no more."""
@@ -47,9 +50,9 @@ class Errors:
     freedom: FloatArray
     inflation: FloatArray
 
-    def half(self, k: int, level: float = 0.975) -> float:
-        """Return the half width of parameter k's interval; ``level`` is one-sided."""
-        return float(stdtrit(float(self.freedom[k]), level)) * float(self.sd[k])
+    def half(self, k: int) -> float:
+        """Return half of parameter k's 95 % interval."""
+        return t_factor(float(self.freedom[k])) * float(self.sd[k])
 
 
 def errors_of(
@@ -64,7 +67,7 @@ def errors_of(
         chosen: The combinations, shape (r, p).
 
     Returns:
-        None where the parameters can't be told apart, or the record is shorter than what its
+        None where the parameters can't be separated, or the record is shorter than what its
         residual takes to forget.
     """
     count, p = design.shape

@@ -16,12 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.judgement.levels import FEWEST
 
+from ...estimators.intervals import t_factor
 from ...estimators.series import Series
-from .errors import FEWEST
 from .fit import (
     GAIN,
     OFFSET,
@@ -48,9 +48,6 @@ MOST_SAMPLES = 1 << 16
 
 MOST_POLES = 2
 
-UPPER = 0.975
-"""One-sided level of a 95 % interval."""
-
 
 @dataclass(frozen=True)
 class Value:
@@ -69,7 +66,7 @@ class Value:
         """Standard error; infinite where it isn't known."""
         if self.ci95 is None:
             return float("inf")
-        return (self.ci95[1] - self.ci95[0]) / 2 / float(stdtrit(self.freedom, UPPER))
+        return (self.ci95[1] - self.ci95[0]) / 2 / t_factor(self.freedom)
 
 
 @dataclass(frozen=True)
@@ -201,10 +198,10 @@ def _intervals(data: Data, fit: Fit) -> list[tuple[float, float]]:
     if fit.errors is None:
         return []
     middle = (float(fit.theta[OFFSET]), float(fit.theta[GAIN]), fit.lag_s)
-    half = [fit.errors.half(k, UPPER) for k in range(len(middle))]
+    half = [fit.errors.half(k) for k in range(len(middle))]
     intervals = [(m - h, m + h) for m, h in zip(middle, half, strict=True)]
     if fit.held and not fit.order:
-        quantile = float(stdtrit(float(fit.errors.freedom[D]), UPPER))
+        quantile = t_factor(float(fit.errors.freedom[D]))
         limit = fit.squares + quantile**2 * data.unit(fit)
         intervals[D] = _places(
             lambda d: data.solved(True, d, 0.0, 0.0)[1] <= limit,
