@@ -70,7 +70,7 @@ STILL_S = 300.0
 """How long the processes that analyse may compute nothing [s]; a network drive that comes back does
 so within minutes."""
 _LOOK_S = 0.5
-_VERSION = 2  # of what is read of a file; those that an earlier one read are read again
+_VERSION = 3  # of what is read of a file; those that an earlier one read are read again
 _UNREAD = -1  # a size that no file has
 _ANALYSED = "analysis of "
 _HALVES = """

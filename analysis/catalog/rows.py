@@ -43,6 +43,16 @@ _JOINT_NUMBERS = (
     "coverage",
 )
 
+_TRACKING = ("tracking_gain", "tracking_lag_s", "offset_rad")
+_TRACKED = {
+    "explained": "tracking_explained",
+    "freedom": "tracking_freedom",
+    "commanded_rad": "commanded_range_rad",
+    "command_mean_rad": "command_mean_rad",
+    "speed_rad_s": "command_speed_rad_s",
+}
+"""Numbers of a joint whose commands are no gait, and their columns."""
+
 
 def _with_interval(*names: str) -> list[str]:
     return [column for name in names for column in (name, f"{name}_low", f"{name}_high")]
@@ -91,7 +101,8 @@ SCHEMAS: Mapping[str, Any] = {
         numbers=" ".join(
             [
                 *("start_s", "stop_s", "cycles", "frequency_hz", *_JOINT_NUMBERS),
-                *_with_interval("gain", "lag_rad"),
+                *_with_interval("gain", "lag_rad", *_TRACKING),
+                *_TRACKED.values(),
             ]
         ),
         lists="flags",
@@ -184,6 +195,7 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
     if result.get("energy") is not None:
         transport = result["energy"]["transport"]
         analysis |= {"distance_m": transport["distance_m"], "cost_of_transport": transport["abs"]}
+    tracking = {joint["joint"]: joint for joint in result.get("tracking") or ()}
     return analysis, [
         window
         | {"joint": joint["name"], "plane": joint["plane"], "position": position}
@@ -191,8 +203,23 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         | {"flags": list(joint["flags"])}
         | _estimate("gain", joint["gain"], joint["gain_ci95"])
         | _estimate("lag_rad", joint["lag_rad"], joint["lag_ci95"])
+        | {"command_mean_rad": joint.get("command_mean_rad")}
+        | _estimate("offset_rad", joint.get("offset_rad"), joint.get("offset_ci95"))
+        | _tracking_row(tracking.get(joint["name"]))
         for position, joint in enumerate(result["joints"])
     ]
+
+
+def _tracking_row(joint: Mapping[str, Any] | None) -> Row:
+    """Return the columns of a joint whose commands are no gait; none for the others."""
+    if joint is None:
+        return {}
+    return {
+        **{column: joint.get(key) for key, column in _TRACKED.items()},
+        **_estimate("tracking_gain", joint["gain"], joint["gain_ci95"]),
+        **_estimate("tracking_lag_s", joint["lag_s"], joint["lag_s_ci95"]),
+        **_estimate("offset_rad", joint["offset_rad"], joint["offset_ci95"]),
+    }
 
 
 def _estimate(name: str, value: float | None, ci95: Sequence[float] | None) -> Row:
@@ -435,15 +462,17 @@ def put_together(database: Any, kind: str) -> Any:
 def _open_rows(
     database: Any, store: ObjectStore, view: str, names: Sequence[str], kind: str
 ) -> None:
-    """Make rows a view of the database; local ones are read when needed."""
+    """Make rows a view of the database; local ones are read when needed.
+
+    Columns that files of earlier versions lack are null.
+    """
     if names and store.is_local:
         paths = ", ".join(_quoted(store.path(name)) for name in names)
+        database.register(f"{view}_columns", table_of(kind, []))
         database.execute(
-            f"create temp view {view} as select * from read_parquet([{paths}], union_by_name=true)"  # noqa: S608
+            f"create temp view {view} as select * from {view}_columns union all by name "  # noqa: S608
+            f"select * from read_parquet([{paths}], union_by_name=true)"
         )
         return
-    import pyarrow as pa
-
-    arrow: Any = pa
-    tables = [store.read_table(name) for name in names] or [table_of(kind, [])]
-    database.register(view, arrow.concat_tables(tables))
+    tables = [table_of(kind, []), *(store.read_table(name) for name in names)]
+    database.register(view, _ARROW.concat_tables(tables, promote_options="default"))

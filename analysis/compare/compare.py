@@ -27,9 +27,20 @@ from ..segments.examine import OFFSET_RAD
 from ..segments.words import deviation_in_words, fault_in_words
 from ..session.runs import GaitRun, command_difference, other_frequency
 from ..signals.stretch import Options
-from .decisions import Margins, answer_of, decide, differ, estimates_of, family
+from .decisions import (
+    DIFFERS,
+    MOVED,
+    Margins,
+    answer_of,
+    decide,
+    differ,
+    estimates_of,
+    family,
+    moved_offsets,
+)
 from .quantities import Motion, Quantities, common_motion, motion_estimates
-from .side import ComparedSession, changes, phases_rad, see, turned
+from .side import ComparedSession, changes, one_robot, phases_rad, see, turned
+from .tracking import at_one_command, commands_differ, fastest_rad_s
 
 
 def broken_joints(
@@ -85,11 +96,13 @@ class Alignment:
         names: Joints that can be compared, head to tail.
         left_out: Joints that can't, and why.
         gaits_differ: How the gaits differ, or None.
+        commands_differ: How the commands of joints differ that are no gait, or None.
     """
 
     names: tuple[str, ...]
     left_out: dict[str, str]
     gaits_differ: str | None
+    commands_differ: str | None = None
 
 
 def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
@@ -134,6 +147,47 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
             "same gait, or compare nevertheless with --any-gait"
         )
     return Alignment(names, left_out, faults[0] if faults else None)
+
+
+def align_commanded(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession], *, any_gait: bool = False
+) -> Alignment:
+    """Find the joints of sessions with commands that can be compared, of gaits or of any motion.
+
+    Args:
+        a: Sessions of one side, at least one.
+        b: Sessions of the other, at least one.
+        any_gait: Compare the responses although the gaits differ.
+
+    Raises:
+        DataError: If no joint can be compared, only some sessions have a gait, or the gaits differ
+            and that is not allowed.
+    """
+    sides = [[one.analysis.tracking for one in side] for side in (a, b)]
+    known = [
+        {place for quantity, place in one.estimates if quantity == "delay"} for one in (*a, *b)
+    ]
+    tracked = [joint.joint for joint in sides[0][0] if all(joint.joint in own for own in known)]
+    if tracked and not any(one.run.names for one in (*a, *b)):
+        for side, own in (("A", a), ("B", b)):
+            _refuse_copies([(one.run.label, _numbers(one, tracked)) for one in own], side)
+        aligned = Alignment((), {}, None)
+    else:
+        aligned = align([one.run for one in a], [one.run for one in b], any_gait=any_gait)
+    some = {name for own in known for name in own} - {*tracked, *aligned.names}
+    left_out = dict.fromkeys(sorted(some), "no gain, lag and offset in all sessions")
+    return replace(
+        aligned,
+        names=(*aligned.names, *(name for name in tracked if name not in aligned.names)),
+        left_out={**left_out, **aligned.left_out},
+        commands_differ=commands_differ(sides[0], sides[1], tracked),
+    )
+
+
+def _numbers(session: ComparedSession, names: Sequence[str]) -> ComplexArray:
+    """Return what a copy of a session has, too."""
+    keys = [(quantity, name) for quantity in ("gain", "delay", "offset") for name in names]
+    return np.array([session.estimates[key][0] for key in keys], np.complex128)
 
 
 def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
@@ -261,17 +315,25 @@ def compare_fitted(
         a, b, aligned, before = _align_motions(a, b)
     else:
         before: Mapping[str, str] = {}
-        aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
+        aligned = align_commanded(a, b, any_gait=choices.any_gait)
+        a, b = _at_one_command(a, b)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
     estimates = [estimates_of(side, keys, about) for side in (a, b)]
     first, second, found = differ(estimates[0], estimates[1], design)
-    decided = decide(keys, first, second, found, choices.margins, before=before)
+    rate_rad_s = fastest_rad_s(one.analysis.tracking for one in (*a, *b)) or 1.0
+    decided = decide(
+        *(keys, first, second, found, choices.margins), before=before, rate_rad_s=rate_rad_s
+    )
     partial = _partial(aligned, " by their phase" if free else "")
     _warn(a, b, design, every_warning.append)
-    broken = broken_joints(a, b)
-    verdict, sentence = answer_of(decided, partial is not None, broken)
+    moved = {one.place for one in moved_offsets(decided)}
+    # What stands off on one side is stated by the difference, which has an interval.
+    broken = tuple(one for one in broken_joints(a, b) if one.kinds or one.name not in moved)
+    alike = one_robot([one.facts for one in (*a, *b)]) and aligned.commands_differ is None
+    verb = MOVED if alike and aligned.gaits_differ is None else DIFFERS
+    verdict, sentence = answer_of(decided, partial is not None, broken, verb)
     return Comparison(
         answer=sentence,
         verdict=verdict,
@@ -338,6 +400,16 @@ def _align_motions(
     return sides[: len(a)], sides[len(a) :], aligned, common.before
 
 
+def _at_one_command(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession]
+) -> tuple[list[ComparedSession], list[ComparedSession]]:
+    """Return both sides with the offsets of each joint at one command."""
+    every = [*a, *b]
+    moved = at_one_command([one.estimates for one in every], [one.commands for one in every])
+    sides = [replace(one, estimates=known) for one, known in zip(every, moved, strict=True)]
+    return sides[: len(a)], sides[len(a) :]
+
+
 def _partial(aligned: Alignment, how: str) -> str | None:
     parts: list[str] = []
     if aligned.left_out:
@@ -345,6 +417,8 @@ def _partial(aligned: Alignment, how: str) -> str | None:
         parts.append(f"only {len(aligned.names)} joints can be compared{how} ({left})")
     if aligned.gaits_differ is not None:
         parts.append(f"the gaits differ: {aligned.gaits_differ}")
+    if aligned.commands_differ is not None:
+        parts.append(aligned.commands_differ)
     return "; ".join(parts) or None
 
 

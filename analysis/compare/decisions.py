@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,8 @@ SIGNIFICANT_DIFFERENCE = 0.05
 _COMPARED = {
     "gain": ("gain", "1"),
     "lag": ("lag", "rad"),
+    "delay": ("lag", "s"),
+    "offset": ("offset", "rad"),
     "amplitude": ("amplitude", "rad"),
     "phase_lag": ("phase lag", "rad"),
     "rest_amplitude": ("amplitude near rest", "rad"),
@@ -51,7 +53,8 @@ class Margins:
 
     Attributes:
         gain: Of amplitudes, too.
-        lag_rad: Of phase lags and wave numbers (a joint), too [rad].
+        lag_rad: Of phase lags, offsets and wave numbers (a joint), too [rad]; of lags in seconds
+            the time in which the fastest command moves by it.
         relative: Of energies (as a share of side A's mean over the joints), speed, cost of
             transport and frequency; of the travelling index itself.
     """
@@ -141,6 +144,7 @@ def decide(
     margins: Margins,
     *,
     before: Mapping[str, str] | None = None,
+    rate_rad_s: float = 1.0,
 ) -> Decided:
     """Decide on a family of differences.
 
@@ -148,10 +152,11 @@ def decide(
         keys: What each is, k.
         margins: What counts as the same.
         before: The joint that each joint's phase lag is taken to.
+        rate_rad_s: Rate of the fastest command whose lag is in seconds [rad/s].
     """
     p, adjusted, half = found.p, holm(found.p), found.half
     kinds = np.array([quantity for quantity, _ in keys])
-    margin = _margins(kinds, a.value, margins)
+    margin = _margins(kinds, a.value, margins, rate_rad_s)
     size = np.abs(found.value) / margin
     decisions: list[Difference] = []
     for k, (quantity, place) in enumerate(keys):
@@ -187,9 +192,10 @@ def _plain(value: float, *, log: bool) -> float:
     return float(np.exp(value)) if log else float(value)
 
 
-def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins) -> FloatArray:
+def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins, rate_rad_s: float) -> FloatArray:
     fixed = {"gain": margins.gain, "amplitude": margins.gain, "frequency": margins.relative}
-    fixed |= dict.fromkeys((*_CYCLIC, "wave_number"), margins.lag_rad)
+    fixed |= dict.fromkeys((*_CYCLIC, "offset", "wave_number"), margins.lag_rad)
+    fixed["delay"] = margins.lag_rad / rate_rad_s
     fixed |= {"travelling_index": margins.relative, "rest_amplitude": margins.lag_rad}
     margin = np.empty(a.size)
     for kind in dict.fromkeys(kinds.tolist()):
@@ -249,42 +255,48 @@ def _equivalence(
 MOST = 4
 """Broken or differing joints that the sentence lists at most."""
 
-RESPONSE = ("gain", "lag", "amplitude", "phase_lag", "rest_amplitude")
+RESPONSE = ("gain", "lag", "delay", "amplitude", "phase_lag", "rest_amplitude")
 """Quantities of a joint that make it a different one."""
 
-_SAME = ("gain", "lag", "amplitude", "phase_lag", "frequency")
+_SAME = ("gain", "lag", "delay", "amplitude", "phase_lag", "frequency")
 """Quantities that two sides have in common if they are the same; other waves follow from them."""
+
+MOVED, DIFFERS = "moved", "differs"
+"""What an offset does between two sessions of one robot with the same commands, and of others."""
 
 
 def answer_of(
-    decided: Decided, partial: bool, broken: Sequence[BrokenJoint] = ()
+    decided: Decided, partial: bool, broken: Sequence[BrokenJoint] = (), verb: str = MOVED
 ) -> tuple[str, str]:
     """Return verdict and answer.
 
     Args:
         partial: Whether something could not be compared.
         broken: Joints that do not follow their command on one side only: the first difference.
+        verb: :data:`MOVED` or :data:`DIFFERS`.
 
     Returns:
         ``different``, ``same``, ``small`` or ``open``, and one sentence without its full stop.
     """
     if broken:
-        rest = answer_of(_without(decided, broken), partial)[1]
+        rest = answer_of(_without(decided, broken), partial, verb=verb)[1]
         listed = "; ".join(each.text for each in broken[:MOST])
         more = len(broken) - MOST
         listed += f"; and {more} more joints" if more > 0 else ""
         return "different", f"{listed}; of the others: {rest}"
     beyond_doubt = _beyond_doubt(decided)
     tests = {one.quantity: one for one in decided.equivalence}
-    main = [tests[quantity] for quantity in _SAME if quantity in tests]
+    # Of a gait's joints means are compared, and not shown to be the same.
+    required = (*_SAME, "offset") if "delay" in tests else _SAME
+    main = [tests[quantity] for quantity in required if quantity in tests]
     at_rest = [one for one in beyond_doubt if one.quantity == "rest_amplitude"]
     same = not at_rest and all(one.p < SIGNIFICANT_DIFFERENCE for one in main)
-    of_joints = [one for one in main if one.quantity in RESPONSE]
-    margins = " and ".join(margin_text(one) for one in of_joints)
+    of_joints = [one for one in main if one.quantity != "frequency"]
+    margins = _listed(margin_text(one) for one in of_joints)
     whole = " (partial comparison)" if partial else ""
     joints = len({one.place for one in decided.differences if not of_body(one.place)})
     which = "the joint" if joints == 1 else f"all {joints} joints"
-    words = " and ".join(WORDS[one.quantity] for one in of_joints)
+    words = _listed(dict.fromkeys(WORDS[one.quantity] for one in of_joints))
     are = "are" if len(of_joints) > 1 else "is"
     alike = f"{words} of {which} {are} equivalent within {margins}"
     if "frequency" in tests:
@@ -293,6 +305,9 @@ def answer_of(
         if same:
             return "same", f"no difference found; {alike}{whole}"
         return "open", f"no difference found, but {_not_shown(decided, main)}{whole}"
+    if moved := offsets_moved(decided, verb):
+        rest = _largest(decided) if _large(decided) else alike if same else ""
+        return "different", f"B differs from A: {'; '.join(filter(None, (moved, rest)))}{whole}"
     if same:
         return "small", f"{alike}; beyond doubt, if small: {_largest(decided)}{whole}"
     return "different", f"B differs from A: {_largest(decided)}{whole}"
@@ -305,6 +320,40 @@ def _beyond_doubt(decided: Decided) -> list[Difference]:
         for one in decided.differences
         if one.p_holm < SIGNIFICANT_DIFFERENCE and leaves_out_zero(one.difference.ci95)
     ]
+
+
+def moved_offsets(decided: Decided) -> list[Difference]:
+    """Return the offsets that differ beyond doubt, by a margin or more, the largest first."""
+    return [one for one in _beyond_doubt(decided) if one.quantity == "offset" and one.size >= 1]
+
+
+def offsets_moved(decided: Decided, verb: str) -> str:
+    """Return which joints' offsets moved, as a clause; empty where none did.
+
+    Args:
+        verb: :data:`MOVED` or :data:`DIFFERS`.
+    """
+    moved = moved_offsets(decided)
+    parts = [
+        f"the offset of {plain(one.place)} {verb} by {signed_difference(one)} between A and B"
+        for one in moved[:MOST]
+    ]
+    if (more := len(moved) - MOST) > 0:
+        parts.append(f"and those of {more} more joints")
+    return ", ".join(parts)
+
+
+def _large(decided: Decided) -> list[str]:
+    """Return the joints whose response differs by a margin or more, the largest first."""
+    beyond_doubt = _beyond_doubt(decided)
+    large = {one.place for one in beyond_doubt if one.quantity in RESPONSE and one.size >= 1}
+    return [one.name for one in decided.named if one.name in large]
+
+
+def _listed(words: Iterable[str]) -> str:
+    """Join words, the last one with "and"."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
@@ -332,6 +381,7 @@ def people_unit(unit: str) -> tuple[float, str]:
         "rad": (math.degrees(1), "°"),
         "rad/joint": (math.degrees(1), "°/joint"),
         "1": (1.0, ""),
+        "s": (1e3, " ms"),
     }
     return units.get(unit, (1.0, f" {unit}"))
 
@@ -385,16 +435,14 @@ def _largest(decided: Decided) -> str:
     comparisons of a hundred that differ in nothing.
     """
     beyond_doubt = _beyond_doubt(decided)
-    large = {one.place for one in beyond_doubt if one.quantity in RESPONSE and one.size >= 1}
-    named = [one.name for one in decided.named if one.name in large]
-    if not named:
+    if not (named := _large(decided)):
         first = beyond_doubt[0]
         others = len(beyond_doubt) - 1
         more = f"; and {others} more" if others else ""
         where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
         where = f"the body's{first.place[len(BODY) + 1 :]}" if of_body(first.place) else where
         return f"{where} {difference_text(first)} ({formats.p_value_text(first.p_holm)}){more}"
-    own = [one for one in beyond_doubt if one.place == named[0] and one.quantity != "energy_abs"]
+    own = [one for one in beyond_doubt if one.place == named[0] and one.quantity in RESPONSE]
     parts = ", ".join(difference_text(one) for one in sorted(own, key=lambda one: one.quantity))
     smallest = min(one.p_holm for one in own)
     others = [plain(name) for name in named[1:]]

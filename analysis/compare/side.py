@@ -9,7 +9,7 @@ it is the crest of that joint's own motion.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -33,6 +33,7 @@ from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span
 from .quantities import Key, Known, Motion, Quantities, from_runs, motion_of
+from .tracking import MeanCommand, mean_commands, offset_estimates, tracking_estimates
 
 PHASES = 72
 """Phases of a mean cycle, every 5 degrees."""
@@ -127,6 +128,16 @@ def facts_of(session: SessionView) -> dict[str, str]:
     return facts | {f"session: {key}": one for key, one in recorded if key not in _OF_THE_RUN}
 
 
+def one_robot(facts: Sequence[Mapping[str, str]]) -> bool:
+    """Return whether sessions may be of one robot: none has another name or serial number.
+
+    Args:
+        facts: Of each session.
+    """
+    keys = ("robot", "session: serial")
+    return all(len({one[key] for one in facts if one.get(key)}) <= 1 for key in keys)
+
+
 def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
     """List the facts that differ between the sides.
 
@@ -181,12 +192,14 @@ class ComparedSession:
 
     Attributes:
         facts: Recorded facts, by their dotted names.
-        estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
-            cost of transport of the body.
+        estimates: ln gain [1], lag [rad] and offset [rad] of the joints, of those whose commands
+            are no gait ln gain, delay [s] and offset; E_abs per cycle [J]; speed [m/s] and cost of
+            transport of the body.
         cycles: Mean cycle of each joint by the phase of the first command of its group, or of the
             first joint's own motion where no commands were logged [rad].
         offsets: Mean of each joint's position less that of its command [rad].
         motion: The periodic motion, where no commands were logged.
+        commands: Those that offsets were measured at, by joint.
     """
 
     analysis: Analysis
@@ -196,6 +209,7 @@ class ComparedSession:
     cycles: Mapping[str, Quantities]
     offsets: Mapping[str, float]
     motion: Motion | None = None
+    commands: Mapping[str, MeanCommand] = field(default_factory=dict[str, MeanCommand])
 
     @property
     def commanded(self) -> bool:
@@ -218,6 +232,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     analysis = measured.analysis
     run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)
+    estimates |= offset_estimates(measured.gait_offsets) | tracking_estimates(analysis.tracking)
     powers = [energies.mechanical for energies in measured.energies.values()]
     total = in_all([None if power is None else power.abs_j for power in powers])
     steps = None
@@ -236,7 +251,9 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     moved = measured.motion
     motion = None if moved is None else motion_of(run.label, session.robot, moved)
     cycles = _cycles(measured, run) if moved is None else _cycles_of_motion(moved, measured.span)
-    return ComparedSession(analysis, run, facts_of(session), estimates, cycles, offsets, motion)
+    commands = mean_commands(measured.gait_offsets, analysis.tracking)
+    facts = facts_of(session)
+    return ComparedSession(analysis, run, facts, estimates, cycles, offsets, motion, commands)
 
 
 def turned(cycle: Quantities, by_rad: float) -> Quantities:

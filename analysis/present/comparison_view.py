@@ -17,7 +17,13 @@ from undulog.capture.common.palette import joint_hex
 
 from ..catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
 from ..catalog.fleet import sentence as change_sentence
-from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text, signed_difference
+from ..compare.decisions import (
+    RESPONSE,
+    SIGNIFICANT_DIFFERENCE,
+    WORDS,
+    margin_text,
+    signed_difference,
+)
 from ..results import formats
 from ..results.comparison import BODY, Comparison, of_body
 from ..results.estimate import Estimate
@@ -195,6 +201,8 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
     for quantity, label, factor in (
         ("gain", "gain [%]", 100.0),
         ("lag", "lag [°]", math.degrees(1)),
+        ("delay", "lag [ms]", 1000.0),
+        ("offset", "offset [°]", math.degrees(1)),
         ("amplitude", "amplitude [%]", 100.0),
         ("phase_lag", "phase lag [°]", math.degrees(1)),
         ("energy_abs", "E_abs [mJ a cycle]", 1000.0),
@@ -220,8 +228,11 @@ def _trials(comparison: Comparison) -> list[Trial]:
 def _facts(comparison: Comparison) -> list[Fact]:
     a, b = len(comparison.a), len(comparison.b)
     joints = len(joints_of(comparison))
-    quantities = ("gain", "lag") if comparison.commanded else ("amplitude", "phase_lag")
-    responses = " or ".join(WORDS[quantity] for quantity in quantities)
+    compared = {one.quantity for one in comparison.differences}
+    quantities = [quantity for quantity in RESPONSE if quantity in compared]
+    quantities = [quantity for quantity in quantities if quantity != "rest_amplitude"]
+    responses = " or ".join(dict.fromkeys(WORDS[quantity] for quantity in quantities))
+    quantities += ["offset"] if "offset" in compared else []
     facts = [
         Fact("Verdict", _VERDICTS[comparison.verdict], "all quantities together, Holm at 5 %"),
         Fact("Sessions", f"{a} and {b}", "on side A and B"),

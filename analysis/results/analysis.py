@@ -302,6 +302,9 @@ class JointResult:
         gain_cycle_sd: Standard deviation of the relative gain from cycle to cycle beyond noise;
             None where there is none.
         lag_cycle_sd_rad: The same of the lag.
+        offset_rad: Mean of the response less that of the command; :attr:`Analysis.tracking` has
+            it of joints that the gait does not drive.
+        command_mean_rad: Mean of the command over the fitted window.
     """
 
     name: str
@@ -326,6 +329,8 @@ class JointResult:
     lag_transient_rad: Estimate = field(default_factory=Estimate)
     gain_cycle_sd: float | None = None
     lag_cycle_sd_rad: float | None = None
+    offset_rad: Estimate = field(default_factory=Estimate)
+    command_mean_rad: float | None = None
 
 
 @dataclass(frozen=True)

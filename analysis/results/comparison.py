@@ -41,7 +41,9 @@ class Difference:
     """One quantity of one joint, or of the body, on both sides.
 
     Attributes:
-        quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``; of sessions
+        quantity: ``gain``, ``lag`` [rad], ``offset`` (mean of the position less that of its
+            command), ``energy_abs``, ``speed`` or ``cost_of_transport``; of joints whose commands
+            are no gait ``delay`` [s] instead of ``lag``; of sessions
             without commands ``amplitude``, ``phase_lag`` (behind the joint before it in its plane),
             ``rest_amplitude`` (of a joint that moves in some sessions only), ``frequency``,
             ``wave_number`` and ``travelling_index``.
@@ -104,7 +106,7 @@ class Equivalence:
     Attributes:
         quantity: As in :class:`Difference`.
         margin: In ``unit``.
-        unit: ``1``, ``rad``, ``rad/joint``, ``J`` or ``m/s``.
+        unit: ``1``, ``rad``, ``rad/joint``, ``s``, ``J`` or ``m/s``.
         largest: The largest difference without its sign; of the logarithm for gains,
             amplitudes and frequencies.
         p: Of 'some difference is as large as the margin'.

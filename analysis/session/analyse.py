@@ -24,6 +24,7 @@ from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import closed_loop, session_couplings
+from ..parts.tracking.gait import gait_offsets
 from ..parts.tracking.measure import Tracked, track_joints
 from ..response.fitting import GaitFit, fit_gait
 from ..response.frequency_response import frequency_responses
@@ -201,6 +202,7 @@ def measure_session(
         energies=energies,
         flags=flags_by_joint(held),
         dead=dead,
+        offsets=tracked.offsets,
         span=span,
     )
     _warn_flags(held, joints, gait, warn)
@@ -274,6 +276,7 @@ def measure_session(
         *(analysis, gait, sound, energies, span, follows.offsets),
         motion=None if columns.command else body.measured.motion,
         cycle=body.measured.cycle,
+        gait_offsets=tracked.offsets,
     )
 
 
@@ -330,6 +333,8 @@ def _tracked(
 ) -> Tracked:
     """Measure how joints follow commands that are no gait, and compare those of one plane.
 
+    Of a gait's joints only the offsets are measured here.
+
     Beside a gait they aren't compared: it is a few joints whose commands are none. Frames of made
     times hold what was sampled earlier or later: their joints aren't compared either, nor are those
     that the judgement names.
@@ -340,7 +345,9 @@ def _tracked(
     planes = by_plane(robot, () if alone else others).values()
     judged = follows.judgement
     statements = (*judged.faults, *judged.changes, *judged.extra, *judged.apart)
-    return track_joints(others, sound, planes, {each.joint for each in statements})
+    tracked = track_joints(others, sound, planes, {each.joint for each in statements})
+    offsets = {} if gait is None else gait_offsets(gait, sound)
+    return dataclasses.replace(tracked, offsets=offsets)
 
 
 def _series(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..energy import GAP_SHARE, TERMS, Energies
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, coverage
 from ..estimators.trends import Trend
+from ..parts.tracking.gait import GaitOffset
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..response.rhythm import phase_step, wave_name
@@ -40,6 +41,7 @@ class SessionMeasurement:
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
         motion: The periodic motion of a session without commands, or None.
         cycle: One cycle of shape and motion of the body, where its pose is known, or None.
+        gait_offsets: Of the joints that the gait drives, by name.
     """
 
     analysis: Analysis
@@ -50,6 +52,7 @@ class SessionMeasurement:
     offsets: Mapping[str, FloatArray]
     motion: MotionFit | None = None
     cycle: GaitCycle | None = None
+    gait_offsets: Mapping[str, GaitOffset] = field(default_factory=dict[str, GaitOffset])
 
 
 def gait_facts(
@@ -135,6 +138,7 @@ def joint_results(
     energies: Mapping[str, Energies],
     flags: Mapping[str, Sequence[str]],
     dead: Mapping[str, DeadBand],
+    offsets: Mapping[str, GaitOffset],
     span: Span,
 ) -> tuple[JointResult, ...]:
     """Return the results of all joints, head to tail.
@@ -142,6 +146,7 @@ def joint_results(
     Args:
         flags: Artefacts of each joint in the analysed window, by name.
         dead: Dead bands, by name.
+        offsets: Of the gait's joints, by name.
         span: The window of energies and coverage.
     """
     planes = planes_of(robot)
@@ -174,10 +179,17 @@ def joint_results(
                 group=index,
                 frequency_hz=None if group is None else group.fit.frequency_hz,
                 dead_band=dead.get(name),
+                **_offset(offsets.get(name)),
                 **_changes(group, name),
             )
         )
     return tuple(results)
+
+
+def _offset(offset: GaitOffset | None) -> dict[str, Any]:
+    if offset is None:
+        return {}
+    return {"offset_rad": offset.offset_rad.estimate, "command_mean_rad": offset.command_rad}
 
 
 def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:

@@ -22,6 +22,7 @@ from undulog.capture.judgement.levels import FEWEST
 
 from ...estimators.intervals import t_factor
 from ...estimators.series import Series
+from ...results.estimate import Estimate
 from .fit import (
     GAIN,
     OFFSET,
@@ -68,6 +69,11 @@ class Value:
             return float("inf")
         return (self.ci95[1] - self.ci95[0]) / 2 / t_factor(self.freedom)
 
+    @property
+    def estimate(self) -> Estimate:
+        """The value with its interval alone."""
+        return Estimate(self.value, self.ci95)
+
 
 @dataclass(frozen=True)
 class Tracking:
@@ -77,6 +83,7 @@ class Tracking:
         gain: g of equation (1).
         lag_s: d + a [s]; one before its cause is 0.
         offset_rad: Mean of the position less that of the delayed command [rad].
+        command_rad: Mean of the delayed command [rad].
         speed_rad_s: Root mean square of the rate of the delayed command [rad/s].
         order: Poles, 0 to 2.
         held: Whether a command that is held until the next explains more than lines.
@@ -87,6 +94,7 @@ class Tracking:
     gain: Value
     lag_s: Value
     offset_rad: Value
+    command_rad: float
     speed_rad_s: float
     order: int
     held: bool
@@ -185,6 +193,7 @@ def _combined(data: Data, fits: Sequence[Fit]) -> Tracking:
         gain=value(GAIN, float(best.theta[GAIN])),
         lag_s=value(D, max(lag_s, 0.0), 0.0),
         offset_rad=value(OFFSET, float(best.theta[OFFSET])),
+        command_rad=float(x.mean()),
         speed_rad_s=float(np.sqrt(np.sum(np.diff(x) ** 2 / np.diff(data.t_s)) / length_s)),
         order=best.order,
         held=best.held,

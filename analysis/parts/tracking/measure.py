@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from undulog.capture.common.process import in_threads
 
 from ...estimators.series import Series
 from ...results.answer import StandOut
-from ...results.estimate import Estimate
 from ...results.frequency_response import JointTracking
 from .compare import unlike
-from .estimate import Tracking, Value, track
+from .estimate import Tracking, track
+from .gait import GaitOffset
 
 MOST_JOINTS = 128
 """Joints that are measured at most: each takes some tens of milliseconds."""
@@ -27,10 +27,12 @@ class Tracked:
     Attributes:
         joints: In the order of the commands; without those whose command doesn't move.
         stand_out: Joints that follow otherwise than those like them.
+        offsets: Of the joints that a gait drives, by name.
     """
 
     joints: tuple[JointTracking, ...] = ()
     stand_out: tuple[StandOut, ...] = ()
+    offsets: Mapping[str, GaitOffset] = field(default_factory=dict[str, GaitOffset])
 
 
 def track_joints(
@@ -63,17 +65,17 @@ def track_joints(
 
 
 def _result(name: str, tracking: Tracking, commanded_rad: float) -> JointTracking:
+    values = (tracking.gain, tracking.lag_s, tracking.offset_rad)
     return JointTracking(
         joint=name,
-        gain=_estimate(tracking.gain),
-        lag_s=_estimate(tracking.lag_s),
-        offset_rad=_estimate(tracking.offset_rad),
+        gain=tracking.gain.estimate,
+        lag_s=tracking.lag_s.estimate,
+        offset_rad=tracking.offset_rad.estimate,
         poles=tracking.order,
         held=tracking.held,
         explained=tracking.explained,
         commanded_rad=commanded_rad,
+        command_mean_rad=tracking.command_rad,
+        speed_rad_s=tracking.speed_rad_s,
+        freedom=min(value.freedom for value in values),
     )
-
-
-def _estimate(value: Value) -> Estimate:
-    return Estimate(value.value, value.ci95)

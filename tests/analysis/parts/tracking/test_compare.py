@@ -14,7 +14,14 @@ def joint(gain=1.0, lag_s=0.1, offset_rad=0.0, *, error=1e-4, **changes):
         half = 2.0 * error  # of 60 degrees of freedom
         return Value(middle, (middle - half, middle + half), 60.0)
 
-    fields = {"speed_rad_s": 0.5, "order": 0, "held": False, "explained": 0.99, "rms_rad": 0.01}
+    fields = {
+        "command_rad": 0.0,
+        "speed_rad_s": 0.5,
+        "order": 0,
+        "held": False,
+        "explained": 0.99,
+        "rms_rad": 0.01,
+    }
     values = value(gain), value(lag_s), value(offset_rad)
     return Tracking(*values, **fields | changes)
 
@@ -73,7 +80,7 @@ def test_what_is_within_the_margins_or_not_known_is_not_named():
     near = joint(gain=1.01, lag_s=0.11, offset_rad=np.radians(0.9), error=1e-6)
     assert unlike(alike | {"near": near}, [[*alike, "near"]]) == ()
     silent = joint(gain=0.5, explained=0.4)
-    unknown = Tracking(Value(0.5), Value(0.1), Value(0.0), 0.5, 0, False, 0.99, 0.01)
+    unknown = Tracking(Value(0.5), Value(0.1), Value(0.0), 0.0, 0.5, 0, False, 0.99, 0.01)
     assert unlike(alike | {"s": silent, "u": unknown}, [[*alike, "s", "u"]]) == ()
     three = robot(np.random.default_rng(1), 3)
     assert unlike(three | {"odd": joint(gain=0.5)}, [["odd", "j0", "j1"]]) == ()
