@@ -91,7 +91,7 @@ def read_signals(session: SessionView, options: Options) -> Signals:
     """
     unused = Remarks()
     columns = read_columns(session, options.command_topic, options.response_topic, unused)
-    stretch = choose_stretch(session, columns, options, unused)
+    stretch = choose_stretch(session, columns, options, unused).stretch
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     half_s = stretch.duration_s / 2
 

@@ -274,6 +274,44 @@ class GaitFacts:
 
 
 @dataclass(frozen=True)
+class JointInWindow:
+    """One joint's response in one window of a constant gait.
+
+    Attributes:
+        joint: Name.
+        command_amplitude_rad: Amplitude of the command.
+        gain: Amplitude of the response over that of the command.
+        lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
+    """
+
+    joint: str
+    command_amplitude_rad: float | None
+    gain: Estimate
+    lag_rad: Estimate
+
+
+@dataclass(frozen=True)
+class GaitWindow:
+    """One gait of a session whose gait changes.
+
+    Attributes:
+        start_s: Start of its window, from the session's start [s].
+        stop_s: End [s].
+        cycles: Periods in it.
+        frequency_hz: Frequency of its largest group of joints.
+        wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
+        joints: In chain order.
+    """
+
+    start_s: float
+    stop_s: float
+    cycles: float
+    frequency_hz: Estimate
+    wave: str | None
+    joints: tuple[JointInWindow, ...]
+
+
+@dataclass(frozen=True)
 class JointResult:
     """One joint's response to its command.
 
@@ -354,6 +392,8 @@ class Analysis(PresentedResult):
 
     Attributes:
         joints: In chain order, head to tail.
+        gaits: Where the gait changes, each with its window; the longest is that of ``gait`` and
+            ``joints``.
         body: Head, middle and tail; None with a note where it is unknown.
         body_shape: Principal modes, the nearest serpenoid and the travel of a cycle; None where
             nothing moves periodically.
@@ -384,6 +424,7 @@ class Analysis(PresentedResult):
     body: BodyResult | None
     heterogeneity: dict[str, Index]
     coupling: Coupling
+    gaits: tuple[GaitWindow, ...] = ()
     body_shape: BodyShape | None = None
     ground_contact: GroundContact | None = None
     over_time: ResponseOverTime | None = None
@@ -407,6 +448,10 @@ class Analysis(PresentedResult):
         return dataclasses.asdict(self) | {
             "gait": _record(self.gait) | {"groups": [_record(one) for one in self.gait.groups]},
             "joints": [_record(joint) for joint in self.joints],
+            "gaits": [
+                _record(gait) | {"joints": [_record(joint) for joint in gait.joints]}
+                for gait in self.gaits
+            ],
             "body": None if self.body is None else _body_dict(self.body),
             "body_shape": None if self.body_shape is None else _shape_dict(self.body_shape),
             "ground_contact": None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from ..results.answer import Artefact, NotFollowing, overlapping
 from ..signals.columns import QUANTITIES, Columns, by_plane
 from ..signals.windows import Stretch
 from .examine import Chain, Findings, examine
+from .pooled import over_gaits
 
 _COMPARABLE = {"lost_samples"}
 """A joint with these faults alone still takes part in the comparison."""
@@ -129,7 +130,7 @@ def stopped(faulty: Iterable[NotFollowing]) -> frozenset[str]:
 
 def compare_joints(
     robot: Robot | None,
-    gait: GaitFit | None,
+    gaits: Sequence[GaitFit],
     joints: Iterable[JointResult],
     *,
     faulty: Iterable[NotFollowing],
@@ -140,15 +141,13 @@ def compare_joints(
 
     Args:
         robot: The robot, or None; then all joints are one chain.
-        gait: The fitted gait, or None.
+        gaits: The fitted gaits, one for each window in which it is constant.
         faulty: Joints that do not follow.
         offsets: Of each joint, cycle by cycle [rad].
 
     Returns:
-        The findings; none without a gait.
+        The findings, of several gaits over all of them; none without a gait.
     """
-    if gait is None:
-        return Findings()
     out = stopped(faulty)
     results = list(joints)
     sound = {j.name for j in results if j.lag_rad.value is not None and j.name not in out}
@@ -156,6 +155,23 @@ def compare_joints(
     if old != sound:  # where all samples are late by a hold, that makes no difference
         sound -= old
     loaded = _loaded(results, commanded)
+    chains = [
+        _chains(robot, gait, sound, commanded=commanded, offsets=offsets, loaded=loaded)
+        for gait in gaits
+    ]
+    return examine(chains[0] if len(chains) == 1 else over_gaits(chains))
+
+
+def _chains(
+    robot: Robot | None,
+    gait: GaitFit,
+    sound: Container[str],
+    *,
+    commanded: tuple[str, ...],
+    offsets: Mapping[str, FloatArray],
+    loaded: frozenset[str],
+) -> list[Chain]:
+    """Return the joints of one gait that are compared, by plane and group."""
     chains: list[Chain] = []
     for index, group in enumerate(gait.groups):
         if group.response is None:
@@ -163,13 +179,13 @@ def compare_joints(
         # A joint that is commanded but in no group has its place in the chain all the same.
         members = [name for name in commanded if gait.group_of(name) in (index, None)]
         for plane, names in by_plane(robot, members).items():
-            own = [name for name in names if name in sound and name in group.answered]
-            response = group.response.select([group.answered.index(name) for name in own])
-            means = {name: offsets[name] for name in own if name in offsets}
+            inside = [name for name in names if name in sound and name in group.answered]
+            response = group.response.select([group.answered.index(name) for name in inside])
+            means = {name: offsets[name] for name in inside if name in offsets}
             chains.append(
-                Chain(plane, index, tuple(names), tuple(own), response, means, loaded=loaded)
+                Chain(plane, index, tuple(names), tuple(inside), response, means, loaded=loaded)
             )
-    return examine(chains)
+    return chains
 
 
 def _loaded(joints: Iterable[JointResult], commanded: tuple[str, ...]) -> frozenset[str]:

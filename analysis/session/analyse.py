@@ -11,7 +11,6 @@ from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
 from undulog.capture.common.extras import base_versions
 from undulog.capture.log.health.rules import judge_made_times
-from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from ..body.free_motion import MotionFit, free_motion
@@ -21,7 +20,7 @@ from ..body.shape import MeasuredShape, body_shape
 from ..dead_band.find import dead_bands
 from ..energy import check_ledger, energy_result, joint_energies, transport
 from ..estimators.intervals import CONFIDENCE
-from ..estimators.series import Series, clean_together
+from ..estimators.series import Series
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import closed_loop, session_couplings
 from ..parts.tracking.gait import gait_offsets
@@ -48,16 +47,16 @@ from ..signals.artefacts import find_artefacts
 from ..signals.columns import Columns, by_plane, drag_ratio, read_columns
 from ..signals.stretch import (
     Options,
-    SharedTimes,
     choose_stretch,
     fetched_part,
-    part_of,
     recorded,
+    series_in,
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
 from .cycles import response_over_time
 from .fields import SessionMeasurement, gait_facts, joint_results
+from .gaits import gait_windows, gaits_in_windows
 from .heterogeneity import heterogeneity_indices
 from .runs import coupling_of_one_gait
 
@@ -144,54 +143,42 @@ def measure_session(
     options = options or Options()
     warn = Remarks()
     session = fetched_part(session, options, warn)
-    topics = (options.command_topic, options.response_topic)
-    columns = read_columns(
-        session,
-        *topics,
-        warn,
-        reference_topic=options.reference_topic,
-        excitation_topic=options.excitation_topic,
-    )
-    options = dataclasses.replace(
-        options,
-        command_topic=columns.topics.get("command", options.command_topic),
-        response_topic=columns.topics.get("position", options.response_topic),
-    )
+    columns, options = _read(session, options, warn)
     for finding in judge_made_times(session.metadata.get("undulog", {})):
         warn(finding.sentence)
     columns, left_out = without_breaks(session, columns, options, warn)
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
-    stretch = choose_stretch(session, columns, options, warn)
+    choice = choose_stretch(session, columns, options, warn)
+    stretch, start_ns = choice.stretch, session.start_ns
     whole = recorded(session, columns, options)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
-    commands = _series(columns.names, columns.command, stretch, origin_ns)
+    commands = series_in(columns.names, columns.command, stretch, origin_ns)
     session.forget()
-    responses = _series(columns.names, columns.position, stretch, origin_ns)
+    responses = series_in(columns.names, columns.position, stretch, origin_ns)
     _warn_dropped(commands, responses, warn)
     session.forget()
     follows = following(session, columns, whole)
     artefacts = unrefuted(find_artefacts(session, columns), follows)
-    during = stretch.since(session.start_ns)
-    held = tuple(one for one in artefacts if one.within(*during))
+    held = tuple(one for one in artefacts if one.within(*stretch.since(start_ns)))
     session.forget()
-    falsified = {one.joint for one in held if one.falsifies("position")}
-    sound = {name: one for name, one in responses.items() if name not in falsified}
+    false = [one.joint for one in held if one.falsifies("position")]
+    sound = {name: one for name, one in responses.items() if name not in false}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
     faulty = not_following(follows)
     # Plateaus of stopped joints are no dead bands.
     moving = {name: one for name, one in sound.items() if name not in stopped(faulty)}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
+    excitation = series_in(columns.names, columns.excitation, stretch, origin_ns)
     swept = (
         ()
         if gait is not None or warn.refused
-        else frequency_responses(
-            *(commands, sound, warn), _series(columns.names, columns.excitation, stretch, origin_ns)
-        )
+        else frequency_responses(commands, sound, warn, excitation)
     )
     tracked = Tracked() if warn.refused else _tracked(session.robot, commands, sound, gait, follows)
     del commands
     session.forget()
+    gaits = gaits_in_windows(columns, choice, gait, artefacts, start_ns)
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)
     joints = joint_results(
@@ -224,7 +211,12 @@ def measure_session(
         Findings(stand_out=tracked.stand_out)
         if gait is None
         else compare_joints(
-            session.robot, gait, joints, faulty=faulty, commanded=commanded, offsets=follows.offsets
+            session.robot,
+            [each.fit for each in gaits] or [gait],
+            joints,
+            faulty=faulty,
+            commanded=commanded,
+            offsets=follows.offsets,
         )
     )
     analysis = Analysis(
@@ -238,6 +230,7 @@ def measure_session(
         ),
         gait=gait_facts(session, gait, span, stretch),
         joints=joints,
+        gaits=gait_windows(session.robot, gaits, start_ns),
         body=body.motion,
         body_shape=body.measured.shape,
         ground_contact=body.contact,
@@ -277,6 +270,23 @@ def measure_session(
         motion=None if columns.command else body.measured.motion,
         cycle=body.measured.cycle,
         gait_offsets=tracked.offsets,
+    )
+
+
+def _read(session: SessionView, options: Options, warn: Warn) -> tuple[Columns, Options]:
+    """Read the joints' columns; the options then name the topics that they are of."""
+    columns = read_columns(
+        session,
+        options.command_topic,
+        options.response_topic,
+        warn,
+        reference_topic=options.reference_topic,
+        excitation_topic=options.excitation_topic,
+    )
+    return columns, dataclasses.replace(
+        options,
+        command_topic=columns.topics.get("command", options.command_topic),
+        response_topic=columns.topics.get("position", options.response_topic),
     )
 
 
@@ -348,19 +358,6 @@ def _tracked(
     tracked = track_joints(others, sound, planes, {each.joint for each in statements})
     offsets = {} if gait is None else gait_offsets(gait, sound)
     return dataclasses.replace(tracked, offsets=offsets)
-
-
-def _series(
-    names: tuple[str, ...], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
-) -> dict[str, Series]:
-    """Return the signals of a time window as series, in chain order."""
-    times: SharedTimes = {}
-    parts = {
-        name: part_of(signals[name], stretch.start_ns, stretch.stop_ns, times)
-        for name in names
-        if name in signals
-    }
-    return clean_together(parts, origin_ns)
 
 
 def _warn_dropped(

@@ -90,7 +90,7 @@ def _group_facts(
         if index > 0:
             first_s, last_s, cycles = whole_cycles(*stretch.since(start_ns), frequency)
             window = Window(first_s, last_s, float(cycles))
-        wave, steps = _wave(robot, group)
+        wave, steps = main_wave(robot, group)
         estimate = Estimate(frequency, around(frequency, half))
         facts = GroupFacts(estimate, group.driven, (window,), wave, steps)
         result.append(_with_changes(facts, group))
@@ -116,7 +116,7 @@ def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
     )
 
 
-def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
+def main_wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
     """Direction of the wave of the plane with the largest command, and each plane's phase step."""
     steps: dict[str, float] = {}
     main, largest = None, 0.0
@@ -160,7 +160,7 @@ def joint_results(
             own.append("gaps")
         index = None if gait is None else gait.group_of(name)
         group = None if gait is None or index is None else gait.groups[index]
-        gain, lag = _estimates(group, name)
+        gain, lag = response_estimates(group, name)
         per_cycle = {term: energies[name].per_cycle(term) for term in TERMS}
         results.append(
             JointResult(
@@ -192,7 +192,8 @@ def _offset(offset: GaitOffset | None) -> dict[str, Any]:
     return {"offset_rad": offset.offset_rad.estimate, "command_mean_rad": offset.command_rad}
 
 
-def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
+def response_estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
+    """Return a joint's gain and lag [rad]; without values where they aren't known."""
     if gait is None or gait.response is None or name not in gait.answered:
         return Estimate(), Estimate()
     place = gait.answered.index(name)

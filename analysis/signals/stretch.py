@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -15,7 +15,8 @@ from undulog.capture.common.errors import DataError, LogError, UsageError
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
-from ..estimators.series import clean
+from ..estimators.series import Series, clean, clean_together
+from ..parts.gaits.windows import several_gaits
 from ..response.groups import find_groups
 from ..response.rhythm import MIN_CYCLES, MIN_EXPLAINED
 from ..results.answer import Leading, Note
@@ -76,6 +77,24 @@ def part_of(one: Signal, start_ns: int, stop_ns: int, times: SharedTimes) -> Sig
     return Signal(one.name, one.unit, t_ns, one.values[inside])
 
 
+def series_in(
+    names: Iterable[str], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
+) -> dict[str, Series]:
+    """Return the signals of a time window as series.
+
+    Args:
+        names: In chain order.
+        origin_ns: Unix time that becomes 0 s.
+    """
+    times: SharedTimes = {}
+    parts = {
+        name: part_of(signals[name], stretch.start_ns, stretch.stop_ns, times)
+        for name in names
+        if name in signals
+    }
+    return clean_together(parts, origin_ns)
+
+
 def without_breaks(
     session: SessionView, columns: Columns, options: Options, warn: Warn
 ) -> tuple[Columns, str]:
@@ -112,7 +131,34 @@ def without_breaks(
     return kept, str(found) if found.others else ""
 
 
-def choose_stretch(session: SessionView, columns: Columns, options: Options, warn: Warn) -> Stretch:
+@dataclass(frozen=True)
+class Choice:
+    """The time window to analyse.
+
+    Attributes:
+        stretch: The window; of several gaits the longest one's.
+        gaits: Windows of a constant gait in order of time, where there are several.
+    """
+
+    stretch: Stretch
+    gaits: tuple[Stretch, ...] = ()
+
+    @classmethod
+    def longest(cls, gaits: Sequence[Stretch], warn: Warn) -> Choice:
+        """Choose the longest of some windows of a constant gait."""
+        longest = max(gaits, key=lambda gait: gait.duration_s)
+        if len(gaits) == 1:
+            return cls(longest)
+        rest = sum(gait.duration_s for gait in gaits) - longest.duration_s
+        warn(
+            f"the gait changes: of {len(gaits)} windows with a constant gait the longest is "
+            f"analysed, and joints are compared over all, {rest:.1f} s in the others (choose with "
+            "--start and --stop)"
+        )
+        return cls(longest, tuple(gaits))
+
+
+def choose_stretch(session: SessionView, columns: Columns, options: Options, warn: Warn) -> Choice:
     """Choose the time window to analyse; a start in the options replaces the settling time.
 
     Raises:
@@ -137,14 +183,7 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
                 "the session states: the gait is analysed before it has settled"
             )
     if runs:
-        longest = max(runs, key=lambda run: run.duration_s)
-        if len(runs) > 1:
-            rest = sum(run.duration_s for run in runs) - longest.duration_s
-            warn(
-                f"the gait parameters change: the longest steady stretch is analysed, {rest:.1f} s "
-                f"in {len(runs) - 1} others are not (choose with --start and --stop)"
-            )
-        return longest
+        return Choice.longest(runs, warn)
     if GAIT_TOPIC in session.channels:
         warn(
             f"no stretch of {MIN_CYCLES:g} cycles has steady gait parameters: the commands are "
@@ -159,8 +198,14 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
             )
         )
         later = chosen
+    series = _swinging(columns, later)
+    span = moving(series)
+    if span is None:
+        return Choice(later)
+    if GAIT_TOPIC not in session.channels and (gaits := _constant(series, span, later)):
+        return Choice.longest(gaits, warn)
     stated = settle_s > 0 or GAIT_TOPIC in session.channels
-    return _in_motion(columns, later, options, warn, stated=stated)
+    return Choice(_in_motion(series, span, later, options, warn, stated=stated))
 
 
 def _too_short(columns: Columns, chosen: Stretch, later: Stretch) -> bool:
@@ -171,13 +216,28 @@ def _too_short(columns: Columns, chosen: Stretch, later: Stretch) -> bool:
 
 
 def _has_gait(columns: Columns, stretch: Stretch) -> bool:
-    series = [
+    found = find_groups(_swinging(columns, stretch), stretch.duration_s)
+    return found is not None and found.explained >= MIN_EXPLAINED
+
+
+def _swinging(columns: Columns, stretch: Stretch) -> list[Series]:
+    """Return the commands of a window, from its start, without joints that turn without end."""
+    return [
         clean(name, signal.t_ns, signal.values, stretch.start_ns).between(0.0, stretch.duration_s)
         for name, signal in columns.command.items()
         if name not in columns.turning
     ]
-    found = find_groups(series, stretch.duration_s)
-    return found is not None and found.explained >= MIN_EXPLAINED
+
+
+def _constant(
+    commands: Sequence[Series], span: tuple[float, float], stretch: Stretch
+) -> list[Stretch]:
+    """Return the windows of several gaits by what the commands repeat."""
+    origin = stretch.start_ns
+    return [
+        Stretch(origin + round(gait.start_s * NS), origin + round(gait.stop_s * NS))
+        for gait in several_gaits(commands, *span)
+    ]
 
 
 def fetched_part(session: SessionView, options: Options, warn: Warn) -> SessionView:
@@ -260,18 +320,16 @@ def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: War
 
 
 def _in_motion(
-    columns: Columns, stretch: Stretch, options: Options, warn: Warn, *, stated: bool
+    series: Sequence[Series],
+    span: tuple[float, float],
+    stretch: Stretch,
+    options: Options,
+    warn: Warn,
+    *,
+    stated: bool,
 ) -> Stretch:
     """Without standing still at the ends; without a soft start where the session states none."""
     origin = stretch.start_ns
-    series = [
-        clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
-        for name, signal in columns.command.items()
-        if name not in columns.turning
-    ]
-    span = moving(series)
-    if span is None:
-        return stretch
     if not stated:
         soft = span
         span = steady_part([one.between(span[0], span[1]) for one in series], *span)

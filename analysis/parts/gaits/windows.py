@@ -1,0 +1,351 @@
+"""Find the time windows in which the commands repeat themselves: each holds one constant gait.
+
+A gait of period T is constant where every command q is that of a period before::
+
+    q(t + T) = q(t)
+
+whatever its shape. A change of pace, direction, amplitude or offset breaks this for the period
+before it and for no other time, so that the windows on both sides end and begin at the change. What
+changes slowly from cycle to cycle, as a warm motor's pace, doesn't break it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from undulog.capture.common.arrays import BoolArray, FloatArray
+
+from ...estimators.series import Series, moves
+from ...response.rhythm import (
+    DRIVEN_SHARE,
+    MIN_CYCLES,
+    MIN_EXPLAINED,
+    MIN_SAMPLES,
+    find_rhythm,
+    liveliest,
+)
+
+CHANGED = 0.05
+"""A joint whose command differs by this share of its own size from that of a period before has
+changed: so do controllers that step their amplitude (``cycles.STEP_SHARE``)."""
+
+MOST_SAMPLES = 1 << 14
+"""Samples of the grid at most."""
+
+LEAST_SAMPLES = 12
+"""Samples of a cycle on the grid at least; a linear interpolation then errs by a thirtieth."""
+
+FINEST = 32
+"""Time windows of the same length in which a period is looked for, at most."""
+
+_SAME_PERIOD = 0.05
+"""Periods up to this share apart are one that moves slowly."""
+
+_SMOOTH = 0.125
+"""Share of a period over which a difference is averaged."""
+
+_NOISE = 4.0
+"""Variance of a difference over that of its noise up to which it is none: a mean over an eighth of
+a cycle has some ten degrees of freedom."""
+
+_MOST_NOISE = 4 * CHANGED
+"""Share of a command's size that its noise may be."""
+
+_STANDING = 0.1
+"""A cycle with less than this share of the largest cycle's size is no gait, but a pause."""
+
+_SLACK = 0.25
+"""Periods that a window may be short of, as its ends are known to a part of one."""
+
+_SWEPT = 0.02
+"""A period that moves by this share from the first to the last third of a window is swept."""
+
+_MAIN_LOBE = 2
+"""Bins of a Hann window's main lobe on each side of a line."""
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """A window in which the commands repeat themselves.
+
+    Attributes:
+        start_s: Start [s].
+        stop_s: End [s].
+        period_s: Their period [s].
+    """
+
+    start_s: float
+    stop_s: float
+    period_s: float
+
+    @property
+    def cycles(self) -> float:
+        """Periods in it."""
+        return (self.stop_s - self.start_s) / self.period_s
+
+    def settled(self) -> Repeats:
+        """The window without its first period."""
+        return replace(self, start_s=self.start_s + self.period_s)
+
+
+def several_gaits(commands: Sequence[Series], start_s: float, stop_s: float) -> list[Repeats]:
+    """Find the windows of the gaits of a motion whose gait changes.
+
+    Args:
+        commands: Commands, m of them.
+        start_s: Start of the motion [s].
+        stop_s: Its end [s].
+
+    Returns:
+        Windows of at least ``MIN_CYCLES`` periods in order of time, without the first period after
+        a change, in which the joints settle. None where there is one gait, or where what repeats
+        itself is less than ``MIN_EXPLAINED`` of the time in motion.
+    """
+    grid = _Grid.of(commands, start_s, stop_s)
+    windows = [] if grid is None else _constant(grid)
+    if grid is None or len(windows) < 2:
+        return []
+    longest_s = max(window.period_s for window in windows)
+    if _covered(windows) < MIN_EXPLAINED * grid.moving_s(longest_s):
+        return []
+    settled = [windows[0], *(window.settled() for window in windows[1:])]
+    return [window for window in settled if window.cycles >= MIN_CYCLES - _SLACK]
+
+
+def _constant(grid: _Grid) -> list[Repeats]:
+    windows: list[Repeats] = []
+    for block in _blocks(grid):
+        periods = [grid.period_in(*limits) for limits in block]
+        new = [period for period in periods if period is not None]
+        if not new:
+            continue
+        candidates = [window for family in _families(new) for window in grid.repeats(family)]
+        windows = _apart([*windows, *candidates])
+        if _covered(windows) >= (1 - _STANDING) * (grid.t_s[-1] - grid.t_s[0]):
+            break
+    windows = _joined(grid, sorted(windows, key=lambda window: window.start_s))
+    if len(windows) > 1:  # one gait may have a pace that moves; of a sweep each window has
+        windows = [window for window in windows if not grid.sweeps(window)]
+    return windows
+
+
+def _joined(grid: _Grid, windows: Iterable[Repeats]) -> list[Repeats]:
+    """Join windows of one gait that noise, or a lost command, has divided."""
+    joined: list[Repeats] = []
+    for window in windows:
+        if joined and grid.continues(joined[-1], window):
+            joined[-1] = replace(joined[-1], stop_s=window.stop_s)
+        else:
+            joined.append(window)
+    return joined
+
+
+def _blocks(grid: _Grid) -> Iterator[list[tuple[int, int]]]:
+    """Yield the whole record, then parts of it that overlap by half and are ever shorter."""
+    yield [(0, grid.t_s.size)]
+    count = 2
+    while count <= FINEST:
+        length = grid.t_s.size // count
+        if length < MIN_CYCLES * LEAST_SAMPLES:
+            return
+        starts = range(0, grid.t_s.size - length + 1, max(length // 2, 1))
+        yield [(first, first + length) for first in starts]
+        count *= 2
+
+
+def _families(periods: Iterable[float]) -> list[list[float]]:
+    """Periods that follow each other closely belong together."""
+    ordered = sorted(periods)
+    families = [ordered[:1]]
+    for before, after in pairwise(ordered):
+        if after > (1 + _SAME_PERIOD) * before:
+            families.append([])
+        families[-1].append(after)
+    return families
+
+
+def _apart(windows: Sequence[Repeats]) -> list[Repeats]:
+    """Windows that don't overlap: the longest first, of equal ones that of the shortest period."""
+    kept: list[Repeats] = []
+    for window in sorted(windows, key=lambda each: each.start_s - each.stop_s + each.period_s):
+        start_s, stop_s = window.start_s, window.stop_s
+        for other in kept:
+            if other.start_s <= start_s < other.stop_s:
+                start_s = other.stop_s
+            if other.start_s < stop_s <= other.stop_s:
+                stop_s = other.start_s
+        inside = any(start_s < other.start_s and other.stop_s < stop_s for other in kept)
+        if not inside and stop_s - start_s >= MIN_CYCLES * window.period_s:
+            kept.append(Repeats(start_s, stop_s, window.period_s))
+    return kept
+
+
+def _covered(windows: Iterable[Repeats]) -> float:
+    return sum(window.stop_s - window.start_s for window in windows)
+
+
+def _in_lines(values: FloatArray) -> bool:
+    """Return whether the power of channels (m, n) is in one line and its harmonics, roughly.
+
+    It takes a hundredth of the time of a fit, which decides.
+    """
+    centred = values - values.mean(axis=1, keepdims=True)
+    power = np.sum(np.abs(np.fft.rfft(centred * np.hanning(values.shape[1]), axis=1)) ** 2, axis=0)
+    peak = int(np.argmax(power))
+    if peak < MIN_CYCLES - 0.5:  # its line would be as wide as the band
+        return False
+    bins = np.arange(power.size)
+    lines = np.zeros(power.size, dtype=np.bool_)
+    for order in (0.5, 1, 1.5, 2, 3):
+        lines |= np.abs(bins - order * peak) <= _MAIN_LOBE
+    return float(power[lines].sum()) >= MIN_EXPLAINED * float(power.sum())
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Commands on common even times.
+
+    Attributes:
+        t_s: Times [s], shape (n,).
+        values: Commands, shape (m, n).
+        running: Sums of the values and of their squares from the start, shape (2, m, n + 1).
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+    running: FloatArray
+
+    @classmethod
+    def of(cls, commands: Sequence[Series], start_s: float, stop_s: float) -> _Grid | None:
+        """Interpolate the commands between two times; joints that hardly move are left out."""
+        inside = [command.between(start_s, stop_s) for command in commands]
+        moving = [each for each in inside if each.count > MIN_SAMPLES and moves(each.values)]
+        if not moving:
+            return None
+        start = max(float(command.t_s[0]) for command in moving)
+        stop = min(float(command.t_s[-1]) for command in moving)
+        step = max(*(command.period_s for command in moving), (stop - start) / MOST_SAMPLES, 0.0)
+        if step <= 0 or stop - start < MIN_CYCLES * LEAST_SAMPLES * step:
+            return None
+        t_s: FloatArray = np.arange(start, stop, step, dtype=np.float64)
+        values = np.stack([command.at(t_s) for command in moving])
+        size = values.std(axis=1)
+        values = values[size > DRIVEN_SHARE * size.max()]
+        values = values - values.mean(axis=1, keepdims=True)
+        running = np.zeros((2, len(values), t_s.size + 1))
+        np.cumsum([values, values**2], axis=2, out=running[:, :, 1:])
+        return cls(t_s, values, running)
+
+    @property
+    def step_s(self) -> float:
+        """Between two samples [s]."""
+        return float(self.t_s[1] - self.t_s[0])
+
+    def continues(self, before: Repeats, after: Repeats) -> bool:
+        """Return whether the commands after a break are those of whole periods before."""
+        period_s = before.period_s
+        periods = np.ceil((after.start_s - before.stop_s) / period_s - _SLACK) + 1
+        if periods > MIN_CYCLES:  # a pause
+            return False
+        first, last = np.searchsorted(self.t_s, (before.stop_s - period_s, before.stop_s)).tolist()
+        t_s = self.t_s[first:last]
+        now = self.values[:, first:last]
+        later, earlier = (
+            np.stack([np.interp(t_s + shift_s, self.t_s, row) for row in self.values])
+            for shift_s in (periods * period_s, -period_s)
+        )
+        change, noise = (np.mean((other - now) ** 2, axis=1) for other in (later, earlier))
+        size = now.var(axis=1)
+        return bool(np.all(change <= _limit(size, noise)))
+
+    def moving_s(self, period_s: float) -> float:
+        """Return how long the commands move [s], by the size of each period."""
+        period = max(round(period_s / self.step_s), 1)
+        size = self._size(period, max(self.t_s.size - period, 0)).max(axis=0, initial=0.0)
+        share = float(np.mean(size > _STANDING**2 * size.max(initial=0.0)))
+        return share * float(self.t_s[-1] - self.t_s[0])
+
+    def sweeps(self, window: Repeats) -> bool:
+        """Return whether the period moves within a window."""
+        first, last = np.searchsorted(self.t_s, (window.start_s, window.stop_s)).tolist()
+        enough = round((MIN_CYCLES + 1) * window.period_s / self.step_s)
+        third = min(max((last - first) // 3, enough), last - first)
+        ends = [self.period_in(first, first + third), self.period_in(last - third, last)]
+        if ends[0] is None or ends[1] is None:
+            return True
+        return abs(float(np.log(ends[1] / ends[0]))) > _SWEPT
+
+    def period_in(self, first: int, last: int) -> float | None:
+        """Return the period of the rhythm that explains the commands in a part of the record."""
+        t_s = self.t_s[first:last]
+        channels = [Series(str(k), t_s, row[first:last]) for k, row in enumerate(self.values)]
+        few = liveliest([channel for channel in channels if moves(channel.values)])
+        if not few or not _in_lines(np.stack([channel.values for channel in few])):
+            return None
+        rhythm = find_rhythm(few, float(t_s[-1] - t_s[0]))
+        if rhythm is None or rhythm.explained < MIN_EXPLAINED:
+            return None
+        period_s = 2 * np.pi / rhythm.omega
+        return period_s if period_s >= LEAST_SAMPLES * self.step_s else None
+
+    def repeats(self, periods: Sequence[float]) -> list[Repeats]:
+        """Return the windows in which the commands repeat themselves with one of some periods."""
+        period_s = float(np.median(periods))
+        width = max(round(_SMOOTH * period_s / self.step_s), 1)
+        lags = {round(period / self.step_s / _SMOOTH) * _SMOOTH for period in periods}
+        longest = int(np.ceil(max(lags))) + 1
+        count = self.t_s.size - longest - width
+        if count < 1:
+            return []
+        size = self._size(round(period_s / self.step_s), count)
+        same: BoolArray = np.zeros(count, dtype=np.bool_)
+        for lag in sorted(lags):
+            same |= self._same(lag, width, count, size)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.view(np.int8), [0]])))
+        spans = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        half = width // 2
+        found = [
+            Repeats(
+                float(self.t_s[first if first == 0 else first + half]),
+                float(self.t_s[min(last - 1 + half + longest - 1, self.t_s.size - 1)]),
+                period_s,
+            )
+            for first, last in spans
+        ]
+        return [window for window in found if window.cycles >= MIN_CYCLES]
+
+    def _size(self, period: int, count: int) -> FloatArray:
+        """Return the variance of each joint over the period from each sample on, shape (m, c)."""
+        period = min(period, self.t_s.size - count)
+        total = self.running[:, :, period : period + count] - self.running[:, :, :count]
+        mean, square = total / period
+        return np.maximum(square - mean**2, 0.0)
+
+    def _same(self, lag: float, width: int, count: int, size: FloatArray) -> BoolArray:
+        """Return from which samples on all joints move as a period later, shape (c,)."""
+        whole = int(lag)
+        part = lag - whole
+        n = count + width
+        later = (1 - part) * self.values[:, whole : whole + n]
+        later += part * self.values[:, whole + 1 : whole + 1 + n]
+        running = np.zeros((len(self.values), n + 1))
+        np.cumsum((later - self.values[:, :n]) ** 2, axis=1, out=running[:, 1:])
+        change = (running[:, width : width + count] - running[:, :count]) / width
+        noise = np.quantile(change, 0.25, axis=1, keepdims=True)
+        lively = size.max(axis=0) > _STANDING**2 * size.max()
+        return lively & np.all(change <= _limit(size, noise), axis=0)
+
+
+def _limit(size: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the mean squared difference of each joint up to which its command is the same.
+
+    Args:
+        size: Variance of the command over a period, joints first.
+        noise: Mean squared difference where nothing changes.
+    """
+    least = np.maximum(size, _STANDING**2 * size.max(axis=0))
+    return np.maximum(CHANGED**2 * least, np.minimum(_NOISE * noise, _MOST_NOISE**2 * least))
