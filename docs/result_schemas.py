@@ -41,7 +41,9 @@ _FLAT = frozenset(
     {
         BodyPoint,
         analysis.GaitFacts,
+        analysis.GaitWindow,
         analysis.GroupFacts,
+        analysis.JointInWindow,
         analysis.JointResult,
         analysis.Transport,
         BodyTravel,

@@ -20,7 +20,7 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
-from ..results.analysis import Analysis, GaitFacts, Index, JointResult
+from ..results.analysis import Analysis, GaitFacts, Index, JointInWindow, JointResult
 from ..results.answer import Artefact, Span
 from ..results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
 from ..results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
@@ -146,6 +146,17 @@ def _of_analysis(result: Analysis) -> Frames:
         "heterogeneity": named(Index, result.heterogeneity),
         "gait": pd.DataFrame([row_of(result.gait)]),
     }
+    if result.gaits:
+        joints = [joint for gait in result.gaits for joint in gait.joints]
+        whose = [gait for gait in result.gaits for _ in gait.joints]
+        frames["gaits"] = table(
+            JointInWindow,
+            joints,
+            start_s=[gait.start_s for gait in whose],
+            stop_s=[gait.stop_s for gait in whose],
+            frequency_hz=[gait.frequency_hz.value for gait in whose],
+            wave=[gait.wave for gait in whose],
+        )
     if result.tracking:
         frames["tracking"] = table(JointTracking, result.tracking)
     if result.body is not None:

@@ -1,10 +1,11 @@
-"""Tables of sessions without a gait: frequency responses, tracking, and motion without commands."""
+"""Tables of sessions without one steady gait: gaits, frequency responses, tracking, free motion."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from ..results.analysis import GaitWindow
 from ..results.estimate import Estimate
 from ..results.formats import degrees, scaled
 from ..results.frequency_response import (
@@ -14,7 +15,7 @@ from ..results.frequency_response import (
     JointMotion,
     JointTracking,
 )
-from .tables import Column, Table, typical
+from .tables import Column, Ends, Quantity, Table, typical
 
 
 def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:
@@ -86,6 +87,56 @@ def tracking_table(joints: Sequence[JointTracking]) -> Table[JointTracking]:
         "model": "what explains the motion; held: each command holds until the next",
     }
     return Table(columns, joints, about=about)
+
+
+def gait_table(gaits: Sequence[GaitWindow]) -> Table[GaitWindow]:
+    """Return the gaits of a session whose gait changes, a row each."""
+
+    def gains(gait: GaitWindow) -> Ends | None:
+        return _ends([joint.gain for joint in gait.joints], 3)
+
+    def lags(gait: GaitWindow) -> Ends | None:
+        return _ends([degrees(joint.lag_rad) for joint in gait.joints], 1)
+
+    columns: list[Column[GaitWindow]] = [
+        Column("gait from s", "from [s]", lambda gait: gait.start_s, (2, 2)),
+        Column("to s", "to [s]", lambda gait: gait.stop_s, (2, 2)),
+        Column("Hz (95 %)", "frequency [Hz]", lambda gait: gait.frequency_hz, typical(3, 4)),
+        Column("cycles", "cycles", lambda gait: gait.cycles, (1, 1), spare=1),
+        Column("wave", "wave", lambda gait: gait.wave, kind="word"),
+        Column("gains", "gain, all joints [1]", gains),
+        Column("lags °", "lag, all joints [°]", lags),
+    ]
+    return Table(columns, gaits)
+
+
+def gait_joint_table(gaits: Sequence[GaitWindow]) -> Table[str]:
+    """Return gain and lag of each joint in each gait, a row a joint; for the page."""
+    joints = [{joint.joint: joint for joint in gait.joints} for gait in gaits]
+    names = list(dict.fromkeys(name for by_name in joints for name in by_name))
+
+    def gain(gait: int) -> Callable[[str], Estimate | None]:
+        return lambda name: joints[gait][name].gain if name in joints[gait] else None
+
+    def lag(gait: int) -> Callable[[str], Estimate | None]:
+        return lambda name: degrees(joints[gait][name].lag_rad) if name in joints[gait] else None
+
+    columns: list[Column[str]] = [Column("joint", "joint", lambda name: name, kind="word")]
+    for k, gait in enumerate(gaits):
+        when = f"{gait.start_s:.0f} to {gait.stop_s:.0f} s"
+        columns += [
+            Column(None, f"gain, {when} [1]", gain(k), typical(3, 4)),
+            Column(None, f"lag, {when} [°]", lag(k), typical(2, 3)),
+        ]
+    return Table(columns, names)
+
+
+def _ends(estimates: Sequence[Estimate], decimals: int) -> Ends | None:
+    """Return the lowest and the highest value, or None where there is none."""
+    values = [each.value for each in estimates if each.value is not None]
+    if not values:
+        return None
+    return Ends(*(Quantity(Estimate(end), decimals) for end in (min(values), max(values))))
 
 
 def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:

@@ -20,7 +20,13 @@ from ..results.coupling import Coupling
 from ..results.estimate import Estimate
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
-from .response_tables import frequency_table, motion_table, tracking_table, wave_table
+from .response_tables import (
+    frequency_table,
+    gait_table,
+    motion_table,
+    tracking_table,
+    wave_table,
+)
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
@@ -233,6 +239,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print(answer.detail)
     moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
     shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
+    if analysis.gaits:
+        shown.append(gait_table(analysis.gaits))
     if analysis.tracking:
         shown = [] if analysis.gait.frequency_hz.value is None else shown
         shown.append(tracking_table(analysis.tracking))

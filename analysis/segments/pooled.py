@@ -47,15 +47,16 @@ def _pooled(chains: Sequence[Chain]) -> Chain:
     weights = np.array([_precision(response) for response in responses])
     weights /= weights.sum()
     ratios = np.stack([response.ratio for response in responses])
-    mean = np.angle(np.mean(ratios / np.abs(ratios), axis=0))
-    phase = mean + np.angle(ratios * np.exp(-1j * mean))  # of a joint within pi of their mean
+    unit = np.mean(ratios / np.abs(ratios), axis=0)
+    unit /= np.abs(unit)
+    logs = np.log(ratios * unit.conj())  # the phases of a joint within pi of their mean
     gain, lag = (
         _mixed([chain.errors[k] for chain in some if chain.errors is not None], weights)
         for k in (0, 1)
     )
     squared = weights[:, np.newaxis] ** 2
     response = Response(
-        np.exp(weights @ np.log(np.abs(ratios)) + 1j * (weights @ phase)),
+        unit * np.exp(weights @ logs),
         np.sum(squared * [each.log_gain_variance for each in responses], axis=0),
         np.sum(squared * [each.lag_variance for each in responses], axis=0),
         np.sum([each.dof for each in responses], axis=0),

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import gammainccinv, gammaincinv
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
@@ -48,9 +49,14 @@ _SAME_PERIOD = 0.05
 _SMOOTH = 0.125
 """Share of a period over which a difference is averaged."""
 
+_QUIET = 0.25
+"""Share of the record in which commands repeat themselves at least: its noise is read there."""
+
+_CHANCE = 1e-6
+"""Chance that white noise exceeds its limit at one sample."""
+
 _NOISE = 4.0
-"""Variance of a difference over that of its noise up to which it is none: a mean over an eighth of
-a cycle has some ten degrees of freedom."""
+"""Mean squared difference over a period or more, in those of noise, up to which it is noise."""
 
 _MOST_NOISE = 4 * CHANGED
 """Share of a command's size that its noise may be."""
@@ -205,6 +211,15 @@ def _in_lines(values: FloatArray) -> bool:
     return float(power[lines].sum()) >= MIN_EXPLAINED * float(power.sum())
 
 
+def _recorded(commands: Iterable[Series], t_s: FloatArray) -> BoolArray:
+    """Return which times lie in no gap of any command, shape (n,)."""
+    recorded: BoolArray = np.ones(t_s.size, dtype=np.bool_)
+    for command in commands:
+        for gap in command.gaps.tolist():
+            recorded &= (t_s <= command.t_s[gap]) | (t_s >= command.t_s[gap + 1])
+    return recorded
+
+
 @dataclass(frozen=True)
 class _Grid:
     """Commands on common even times.
@@ -212,11 +227,13 @@ class _Grid:
     Attributes:
         t_s: Times [s], shape (n,).
         values: Commands, shape (m, n).
+        recorded: Where no command has a gap, shape (n,).
         running: Sums of the values and of their squares from the start, shape (2, m, n + 1).
     """
 
     t_s: FloatArray
     values: FloatArray
+    recorded: BoolArray
     running: FloatArray
 
     @classmethod
@@ -238,7 +255,7 @@ class _Grid:
         values = values - values.mean(axis=1, keepdims=True)
         running = np.zeros((2, len(values), t_s.size + 1))
         np.cumsum([values, values**2], axis=2, out=running[:, :, 1:])
-        return cls(t_s, values, running)
+        return cls(t_s, values, _recorded(moving, t_s), running)
 
     @property
     def step_s(self) -> float:
@@ -246,21 +263,31 @@ class _Grid:
         return float(self.t_s[1] - self.t_s[0])
 
     def continues(self, before: Repeats, after: Repeats) -> bool:
-        """Return whether the commands after a break are those of whole periods before."""
+        """Return whether the commands between two windows repeat themselves but for noise.
+
+        They do at single samples where noise is large, for the mean of the time between; and
+        what comes then is that of whole periods before.
+        """
         period_s = before.period_s
         periods = np.ceil((after.start_s - before.stop_s) / period_s - _SLACK) + 1
-        if periods > MIN_CYCLES:  # a pause
-            return False
-        first, last = np.searchsorted(self.t_s, (before.stop_s - period_s, before.stop_s)).tolist()
-        t_s = self.t_s[first:last]
-        now = self.values[:, first:last]
-        later, earlier = (
-            np.stack([np.interp(t_s + shift_s, self.t_s, row) for row in self.values])
-            for shift_s in (periods * period_s, -period_s)
-        )
-        change, noise = (np.mean((other - now) ** 2, axis=1) for other in (later, earlier))
-        size = now.var(axis=1)
-        return bool(np.all(change <= _limit(size, noise)))
+        noise = self._change(before.start_s, before.stop_s - period_s, period_s)
+        between = self._change(before.stop_s - period_s, after.start_s, period_s)
+        over = self._change(before.stop_s - period_s, before.stop_s, periods * period_s)
+        first, stop = np.searchsorted(self.t_s, (before.stop_s - period_s, before.stop_s)).tolist()
+        limit = _limit(self.values[:, first:stop].var(axis=1), _NOISE * noise)
+        return bool(np.all(between <= limit) and np.all(over <= limit))
+
+    def _change(self, start_s: float, stop_s: float, lag_s: float) -> FloatArray:
+        """Return the mean squared difference to a time later, shape (m,)."""
+        t_s = self.t_s[slice(*np.searchsorted(self.t_s, (start_s, stop_s)).tolist())]
+        later_s = t_s + lag_s
+        recorded = np.interp(t_s, self.t_s, self.recorded) == 1
+        recorded &= np.interp(later_s, self.t_s, self.recorded) == 1
+        difference = [
+            np.interp(later_s[recorded], self.t_s, row) - np.interp(t_s[recorded], self.t_s, row)
+            for row in self.values
+        ]
+        return np.sum(np.square(difference), axis=1) / max(np.count_nonzero(recorded), 1)
 
     def moving_s(self, period_s: float) -> float:
         """Return how long the commands move [s], by the size of each period."""
@@ -332,10 +359,16 @@ class _Grid:
         n = count + width
         later = (1 - part) * self.values[:, whole : whole + n]
         later += part * self.values[:, whole + 1 : whole + 1 + n]
+        recorded = self.recorded[:n] & self.recorded[whole : whole + n]
+        recorded &= self.recorded[whole + 1 : whole + 1 + n]
         running = np.zeros((len(self.values), n + 1))
-        np.cumsum((later - self.values[:, :n]) ** 2, axis=1, out=running[:, 1:])
+        # What wasn't recorded shows no change.
+        np.cumsum(recorded * (later - self.values[:, :n]) ** 2, axis=1, out=running[:, 1:])
         change = (running[:, width : width + count] - running[:, :count]) / width
-        noise = np.quantile(change, 0.25, axis=1, keepdims=True)
+        noise = np.quantile(change, _QUIET, axis=1, keepdims=True)
+        # A mean of w squares has the distribution of chi-squared over w; noise of few samples'
+        # memory has half as many that are independent.
+        noise = noise * gammainccinv(width / 4, _CHANCE) / gammaincinv(width / 4, _QUIET)
         lively = size.max(axis=0) > _STANDING**2 * size.max()
         return lively & np.all(change <= _limit(size, noise), axis=0)
 
@@ -345,7 +378,7 @@ def _limit(size: FloatArray, noise: FloatArray) -> FloatArray:
 
     Args:
         size: Variance of the command over a period, joints first.
-        noise: Mean squared difference where nothing changes.
+        noise: Mean squared difference that noise makes at most.
     """
     least = np.maximum(size, _STANDING**2 * size.max(axis=0))
-    return np.maximum(CHANGED**2 * least, np.minimum(_NOISE * noise, _MOST_NOISE**2 * least))
+    return np.maximum(CHANGED**2 * least, np.minimum(noise, _MOST_NOISE**2 * least))
