@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import gammainccinv, gammaincinv
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ...estimators.series import Series, moves
 from ...response.rhythm import (
@@ -204,7 +204,7 @@ def _in_lines(values: FloatArray) -> bool:
     peak = int(np.argmax(power))
     if peak < MIN_CYCLES - 0.5:  # its line would be as wide as the band
         return False
-    bins = np.arange(power.size)
+    bins: IntArray = np.arange(power.size, dtype=np.int64)
     lines = np.zeros(power.size, dtype=np.bool_)
     for order in (0.5, 1, 1.5, 2, 3):
         lines |= np.abs(bins - order * peak) <= _MAIN_LOBE
@@ -283,17 +283,23 @@ class _Grid:
         later_s = t_s + lag_s
         recorded = np.interp(t_s, self.t_s, self.recorded) == 1
         recorded &= np.interp(later_s, self.t_s, self.recorded) == 1
-        difference = [
-            np.interp(later_s[recorded], self.t_s, row) - np.interp(t_s[recorded], self.t_s, row)
-            for row in self.values
-        ]
-        return np.sum(np.square(difference), axis=1) / max(np.count_nonzero(recorded), 1)
+        difference = self._at(later_s[recorded]) - self._at(t_s[recorded])
+        squares: FloatArray = np.sum(difference**2, axis=1)
+        return squares / max(np.count_nonzero(recorded), 1)
+
+    def _at(self, t_s: FloatArray) -> FloatArray:
+        """Return the commands at other times, shape (m, k)."""
+        place: FloatArray = (t_s - self.t_s[0]) / self.step_s
+        before: IntArray = np.clip(place.astype(np.int64), 0, self.t_s.size - 2)
+        part: FloatArray = np.clip(place - before, 0.0, 1.0)
+        return (1 - part) * self.values[:, before] + part * self.values[:, before + 1]
 
     def moving_s(self, period_s: float) -> float:
         """Return how long the commands move [s], by the size of each period."""
         period = max(round(period_s / self.step_s), 1)
-        size = self._size(period, max(self.t_s.size - period, 0)).max(axis=0, initial=0.0)
-        share = float(np.mean(size > _STANDING**2 * size.max(initial=0.0)))
+        size: FloatArray = self._size(period, max(self.t_s.size - period, 0)).max(axis=0)
+        moving: BoolArray = size > _STANDING**2 * size.max(initial=0.0)
+        share = np.count_nonzero(moving) / max(moving.size, 1)
         return share * float(self.t_s[-1] - self.t_s[0])
 
     def sweeps(self, window: Repeats) -> bool:
