@@ -1,7 +1,6 @@
 """A robot over many sessions: joints that change, trends, variance components, outliers.
 
-Gain enters by its logarithm and energy by that of the energy per second, so that a change is a
-ratio; lag enters in rad.
+Of robots with few sessions the latest is compared with the earlier ones (:mod:`.earlier`).
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import json
 import math
 import warnings
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,19 +20,32 @@ from undulog.capture.common.errors import MissingExtraError
 from ..estimators.intervals import holm
 from ..results.estimate import Interval
 from .change_points import LEAST_SESSIONS, ChangePoint, Judged, Kind, find_change_points
+from .earlier import DIFFERENCES, Departure, departure_sentence, departures, size_text
+from .joint_tables import Frame, by_session, conditions_of, values_of
 from .session_noise import relative_to_others
 
-_Frame: TypeAlias = Any  # pandas.DataFrame; its stubs don't know the columns' types
+QUANTITIES = {
+    "gain": "gain",
+    "lag": "lag [rad]",
+    "delay": "lag [s]",
+    "offset": "offset [rad]",
+    "energy": "energy [W]",
+}
+"""Quantity of a joint to its name with the unit; a delay is the lag of any other motion."""
 
-QUANTITIES = {"gain": "gain", "lag": "lag [rad]", "energy": "energy [W]"}
-"""Quantity of a joint to its name with the unit."""
+SIZES = {
+    "gain": math.log(1.05),
+    "lag": 0.05,
+    "delay": 0.01,
+    "offset": math.radians(1),
+    "energy": math.log(1.1),
+}
+"""Changes that matter, of ln gain, lag [rad], delay [s], offset [rad] and ln energy: a twentieth of
+the amplitude, in phase or a quarter of a cycle from it, and of energy, which goes with its square,
+twice that; a delay of 10 ms is a twentieth of a cycle's radian at 0.8 Hz."""
 
-SIZES = {"gain": math.log(1.05), "lag": 0.05, "energy": math.log(1.1)}
-"""Changes that matter, of ln gain, lag [rad] and ln energy: a twentieth of the amplitude, in phase
-or a quarter of a cycle from it, and of energy, which goes with its square, twice that."""
-
+_NAMES = {"delay": "lag"}
 _TRENDS = ("lag_sd", "gain_cv", "energy_cv", "cost_of_transport", "distance_m", "frequency_hz")
-_LEAST_JOINTS = 3
 _SAME = 1e-9  # relative: equal but for rounding
 _MOST_UNCHANGED = 5
 """Robots without changes that the first sentence names."""
@@ -50,7 +62,7 @@ class JointChange:
         date: Its start (UTC, ISO 8601).
         earliest: Start of the last session before the 95 % interval of the change.
         latest: Start of the last session in it.
-        change: Ratio minus 1 for gain and energy; rad for lag.
+        change: Ratio minus 1 for gain and energy; rad for lag and offset, s for delay.
         change_ci95: Its 95 % interval.
         gradual: Whether the change takes time; else it is a step.
         t: Size over its standard error. A joint that wears moves its neighbours, too, and less.
@@ -187,11 +199,14 @@ class Fleet:
 
     Attributes:
         answer: The first sentence.
+        departures: Joints of robots with too few sessions for changes, whose latest session
+            differs from the earlier ones; the surest first.
     """
 
     answer: str
     robots: tuple[RobotHistory, ...]
     warnings: tuple[str, ...] = field(default=())
+    departures: tuple[Departure, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain JSON values."""
@@ -208,10 +223,11 @@ def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
     Raises:
         MissingExtraError: If statsmodels is not installed.
     """
-    table: _Frame = sessions
+    table: Frame = sessions
     analysed = table[(table["status"] == "analysed") & table["start"].notna()]
     histories: list[RobotHistory] = []
     left_out: list[str] = []
+    departed: list[Departure] = []
     serial = analysed["serial"] if "serial" in analysed else pd.Series("", analysed.index)
     names = [analysed["robot"].fillna("(no name)"), serial.fillna("")]
     for (robot, number), own in analysed.groupby(names, sort=True):
@@ -222,23 +238,34 @@ def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
             name = _label(str(robot), str(number))
             few = f"{history} of at least {LEAST_SESSIONS} analysed sessions with the same joints"
             left_out.append(f"{name}: not decided, {few}")
-    answer = _answer(histories, left_out)
+            of_robot = joints[joints["path"].isin(own["path"])]
+            departed += departures(str(robot), str(number), own.sort_values("start"), of_robot)
+    departed.sort(key=lambda departure: departure.p)
+    answer = _answer(histories, left_out, departed)
     if missing := len(sessions) - len(analysed):
         left_out.append(f"{missing} sessions are not analysed: undulog catalog --analyse")
-    return Fleet(answer, tuple(histories), tuple(left_out))
+    return Fleet(answer, tuple(histories), tuple(left_out), tuple(departed))
 
 
-def _answer(histories: list[RobotHistory], left_out: list[str]) -> str:
+def _answer(histories: list[RobotHistory], left_out: list[str], departed: list[Departure]) -> str:
     changes = [(history, change) for history in histories for change in history.changes]
-    if not histories:
+    if not histories and not departed:
         few = f" ({left_out[0]})" if left_out else ""
         return f"No robot has enough analysed sessions to compare them over time{few}."
+    sentences: list[str] = []
+    if changes:
+        history, change = max(changes, key=lambda pair: pair[1].t)
+        more = len(changes) - 1
+        others = f"; {more} more change{'s' if more > 1 else ''}" if more else ""
+        sentences.append(f"{history.label}: {sentence(change)}{others}{_correlations(history)}.")
+    if departed:
+        first, more = departed[0], len(departed) - 1
+        others = f"; {more} more difference{'s' if more > 1 else ''}" if more else ""
+        label = _label(first.robot, first.serial)
+        sentences.append(f"{label}: {departure_sentence(first)}{others}.")
     if not changes:
-        return " ".join(map(_unchanged, histories[:_MOST_UNCHANGED]))
-    history, change = max(changes, key=lambda pair: pair[1].t)
-    more = len(changes) - 1
-    others = f"; {more} more change{'s' if more > 1 else ''}" if more else ""
-    return f"{history.label}: {sentence(change)}{others}{_correlations(history)}."
+        sentences += map(_unchanged, histories[:_MOST_UNCHANGED])
+    return " ".join(sentences)
 
 
 def _unchanged(history: RobotHistory) -> str:
@@ -246,9 +273,7 @@ def _unchanged(history: RobotHistory) -> str:
     decided = [memory for memory in history.memory if memory.sessions_needed <= history.sessions]
     parts: list[str] = []
     if decided:
-        sizes = ", ".join(
-            f"{m.quantity} {_size_text(m.quantity, m.smallest_step)}" for m in decided
-        )
+        sizes = ", ".join(f"{m.quantity} {size_text(m.quantity, m.smallest_step)}" for m in decided)
         parts.append(
             f"no joint changes over {history.sessions} sessions, where steps show ({sizes})"
         )
@@ -266,36 +291,33 @@ def _correlations(history: RobotHistory) -> str:
     return f"; lag-one correlation of sessions: {listed}"
 
 
-def _size_text(quantity: str, value: float | None) -> str:
-    by = abs(value or 0.0)
-    return f"{math.degrees(by):.2g}°" if quantity == "lag" else f"{by * 100:.2g} %"
-
-
 def sentence(change: JointChange) -> str:
     """Return a change in words, without a full stop."""
-    size = _size_text(change.quantity, change.change)
+    size, name = size_text(change.quantity, change.change), change.quantity
     way = "rises" if change.change > 0 else "falls"
+    if name == "offset":
+        way, size = "moved", f"{'+' if change.change > 0 else '−'}{size}"
     gradually = ", gradually," if change.gradual else ""
     return (
-        f"the {change.quantity} of {change.joint} {way} by {size}{gradually} against the other "
-        f"joints from {change.date[:10]} on (95 %: {change.earliest[:10]} to {change.latest[:10]})"
+        f"the {_NAMES.get(name, name)} of {change.joint} {way} by {size}{gradually} against the "
+        f"other joints from {change.date[:10]} on (95 %: {change.earliest[:10]} to "
+        f"{change.latest[:10]})"
     )
 
 
-def _history(robot: str, serial: str, sessions: _Frame, joints: _Frame) -> RobotHistory | int:
+def _history(robot: str, serial: str, sessions: Frame, joints: Frame) -> RobotHistory | int:
     """Return the history of a robot, or the number of its sessions where they are too few."""
     own = joints[joints["path"].isin(sessions["path"])]
     tables = {
-        "gain": _table(own, np.log(own["gain"].where(own["gain"] > 0))),
-        "lag": _table(own, own["lag_rad"]),
-        "energy": _table(own, _log_power(own, sessions)),
+        name: table
+        for name, values in values_of(own, sessions).items()
+        if (table := by_session(own, values)) is not None
     }
-    tables = {name: table for name, table in tables.items() if table is not None}
     if "gain" not in tables or len(tables["gain"]) < LEAST_SESSIONS:
         return len(tables.get("gain", ()))
     ordered = sessions[sessions["path"].isin(tables["gain"].index)].set_index("path")
     tables = {name: table.reindex(ordered.index) for name, table in tables.items()}
-    conditions = _conditions(own, ordered)
+    conditions = conditions_of(own, ordered)
     times_s = ordered["start"].astype("int64").to_numpy() / 1e9
     relative = [relative_to_others(table.to_numpy(float), conditions) for table in tables.values()]
     judged = dict(zip(tables, find_change_points(relative, times_s, conditions), strict=True))
@@ -333,36 +355,7 @@ def _history(robot: str, serial: str, sessions: _Frame, joints: _Frame) -> Robot
     )
 
 
-def _table(joints: _Frame, values: _Frame) -> _Frame | None:
-    """Return values by session and joint, of joints in most sessions, sessions with most joints."""
-    latest = joints.assign(value=values).dropna(subset=["value"])
-    if latest.empty:
-        return None
-    table = latest.pivot_table(index="path", columns="joint", values="value", aggfunc="last")
-    table = table.reindex(columns=latest.groupby("joint")["position"].first().sort_values().index)
-    table = table.loc[:, table.notna().mean() >= 0.5]
-    table = table[table.notna().sum(axis=1) >= max(_LEAST_JOINTS, table.shape[1] / 2)]
-    return table if table.shape[1] >= _LEAST_JOINTS and len(table) else None
-
-
-def _log_power(joints: _Frame, sessions: _Frame) -> _Frame:
-    length_s = joints["stop_s"] - joints["start_s"]
-    whole_s = joints["path"].map(sessions.set_index("path")["duration_s"])
-    power = joints["energy_abs_j"] / length_s.fillna(whole_s)
-    return np.log(power.where(power > 0))
-
-
-def _conditions(joints: _Frame, sessions: _Frame) -> IntArray:
-    """Number the gaits: sessions of one frequency and one mean amplitude, to two digits."""
-    driven = joints[joints["gain"].notna()]
-    amplitude = driven.groupby("path")["command_amplitude_rad"].mean().reindex(sessions.index)
-    frequency = driven.groupby("path")["frequency_hz"].mean().reindex(sessions.index)
-    pairs = zip(amplitude.fillna(0.0), frequency.fillna(0.0), strict=True)
-    keys = [f"{size:.1e}/{rate:.1e}" for size, rate in pairs]
-    return np.unique(keys, return_inverse=True)[1].astype(np.int64)
-
-
-def _change(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) -> JointChange:
+def _change(quantity: str, joint: str, point: ChangePoint, sessions: Frame) -> JointChange:
     starts = sessions["start"]
     low, high = point.change_ci95
     return JointChange(
@@ -380,7 +373,7 @@ def _change(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) -> 
     )
 
 
-def _outlier(quantity: str, joint: str, point: ChangePoint, sessions: _Frame) -> Outlier:
+def _outlier(quantity: str, joint: str, point: ChangePoint, sessions: Frame) -> Outlier:
     return Outlier(
         path=str(sessions.index[point.session]),
         date=_date(sessions["start"].iloc[point.session]),
@@ -406,14 +399,14 @@ def _memory(quantity: str, judged: Judged, sessions: int) -> Memory:
 
 
 def _as_change(quantity: str, value: float) -> float:
-    return value if quantity == "lag" else math.expm1(value)
+    return value if quantity in DIFFERENCES else math.expm1(value)
 
 
 def _date(start: Any) -> str:
     return pd.Timestamp(start).isoformat(timespec="seconds")
 
 
-def _trends(sessions: _Frame) -> list[Trend]:
+def _trends(sessions: Frame) -> list[Trend]:
     """Kendall's tau of each result against the date and each number that a sweep varied."""
     from scipy import stats  # takes half a second
 
@@ -443,7 +436,7 @@ def _trends(sessions: _Frame) -> list[Trend]:
     return [replace(trend, p=p) for trend, p in zip(found, adjusted, strict=True)]
 
 
-def _covariates(sessions: _Frame) -> dict[str, FloatArray]:
+def _covariates(sessions: Frame) -> dict[str, FloatArray]:
     """Days since 1970, and the changes of the sweeps that the sessions come from."""
     changes = pd.DataFrame(
         [json.loads(text) if isinstance(text, str) else {} for text in sessions["changes"]]
@@ -457,7 +450,7 @@ def _is_constant(values: FloatArray) -> bool:
     return bool(np.ptp(values) <= _SAME * np.abs(values).max())
 
 
-def _components(name: str, table: _Frame, conditions: IntArray) -> Components:
+def _components(name: str, table: Frame, conditions: IntArray) -> Components:
     """Fit value = condition + session + joint + residual, the last three random."""
     try:
         import statsmodels.formula.api as formulas

@@ -15,6 +15,7 @@ import pandas as pd
 
 from undulog.capture.common.palette import joint_hex
 
+from ..catalog.earlier import departure_sentence
 from ..catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
 from ..catalog.fleet import sentence as change_sentence
 from ..compare.decisions import (
@@ -267,6 +268,7 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
     return {
         "fleet": fleet,
         "where": where,
+        "departures": [departure_sentence(departure) for departure in fleet.departures],
         "warnings": [*fleet.warnings, *(w for h in fleet.robots for w in h.warnings)],
         "contents": [
             (f"robot{k}", h.label or "Robot without a name")
@@ -288,15 +290,16 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
     }
 
 
+_SPREADS = {"lag": (math.degrees(1), "°"), "offset": (math.degrees(1), "°"), "delay": (1e3, " ms")}
+"""Factor and unit of quantities that are no ratios."""
+
+
 def spread_text(quantity: str, value: float | None) -> str:
-    """Return a standard deviation as people read it: degrees for lag, percent for the others."""
+    """Return a standard deviation as people read it: degrees, milliseconds, or percent."""
     if value is None:
         return formats.number(None, 0)
-    return (
-        f"{formats.number(math.degrees(value), 2)}°"
-        if quantity == "lag"
-        else f"{formats.number(100 * value, 2)} %"
-    )
+    factor, unit = _SPREADS.get(quantity, (100.0, " %"))
+    return f"{formats.number(factor * value, 2)}{unit}"
 
 
 def change_text(quantity: str, value: float) -> str:
@@ -338,12 +341,16 @@ def _change_drawing(
     history: RobotHistory, change: JointChange, joints: pd.DataFrame, prefix: str
 ) -> Drawing:
     """Draw the values of a joint that changes over its sessions, the others behind it."""
-    column = {"gain": "gain", "lag": "lag_rad", "energy": "energy_abs_j"}[change.quantity]
+    columns = {"lag": "lag_rad", "offset": "offset_rad", "energy": "energy_abs_j"}
+    column = (columns | {"gain": "gain", "delay": "tracking_lag_s"})[change.quantity]
     table: Any = joints
     named = (table["robot"] == history.robot) & (table["serial"].fillna("") == history.serial)
     own = table[named & table["joint"].isin(history.joints)]
+    if change.quantity == "gain" and "tracking_gain" in own:
+        own = own.assign(gain=own["gain"].fillna(own["tracking_gain"]))
     own = own.dropna(subset=[column]).sort_values("start")
-    values = own[column].map(math.degrees) if change.quantity == "lag" else own[column]
+    degrees = change.quantity in ("lag", "offset")
+    values = own[column].map(math.degrees) if degrees else own[column]
     if change.quantity == "energy":
         values /= own["stop_s"] - own["start_s"]
     colors = dict(zip(history.joints, joint_hex(len(history.joints)), strict=True))

@@ -117,6 +117,28 @@ def test_a_worn_joint_is_named_with_its_date(without_models, few_simulations):
     assert "lag-one correlation of sessions: gain 0.0" in fleet.answer
 
 
+def test_an_offset_that_moved_is_named_with_its_date(without_models, few_simulations):
+    """The commands are no gait: gains, lags in seconds and offsets are those of any motion."""
+    sessions, rows, name, begun = frames(3, "none", n=40, joints=7)
+    rng, moved = np.random.default_rng(4), (rows["joint"] == name).to_numpy()
+    late = np.repeat((sessions["start"] > begun).to_numpy(), 7)
+    rows = rows.rename(columns={"gain": "tracking_gain", "lag_rad": "tracking_lag_s"}).assign(
+        gain=np.nan,
+        lag_rad=np.nan,
+        offset_rad=np.where(moved & late, np.radians(5.1), 0.0)
+        + np.radians(0.3) * rng.standard_normal(len(rows)),
+        command_mean_rad=0.0,
+        commanded_range_rad=1.0,
+        command_speed_rad_s=1.0,
+    )
+    fleet = analyse_fleet(sessions, rows)
+    (change,) = fleet.robots[0].changes
+    assert (change.joint, change.quantity, change.gradual) == (name, "offset", False)
+    assert change.earliest <= begun.isoformat() <= change.latest
+    assert change.change_ci95[0] < np.radians(5.1) < change.change_ci95[1]
+    assert f"the offset of {name} moved by +5" in fleet.answer
+
+
 @pytest.mark.nightly
 def test_variance_components_are_those_planted():
     sessions, rows, _, _ = frames(8)
