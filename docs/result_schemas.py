@@ -25,6 +25,7 @@ from undulog.analysis.results.frequency_response import (
     JointFrequencyResponse,
     JointMotion,
     JointTracking,
+    LocalWaveNumber,
 )
 
 VERSION = 1
@@ -52,6 +53,7 @@ _FLAT = frozenset(
         JointTracking,
         JointMotion,
         LinkContact,
+        LocalWaveNumber,
         Serpenoid,
         ShapeMode,
     }

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD
 from undulog.capture.robot.model import Robot
 
 from ..estimators.harmonic import HarmonicFit, fit_at
@@ -26,7 +27,7 @@ from ..estimators.series import Series
 from ..estimators.spectrum import ResidualBins, residual_spectrum
 from ..response.fitting import GaitFit
 from ..results.estimate import Estimate, Interval
-from ..results.frequency_response import BodyWave, FreeMotion, JointMotion
+from ..results.frequency_response import BodyWave, FreeMotion, JointMotion, LocalWaveNumber
 from ..signals.columns import by_plane
 
 _GRID = 16
@@ -131,12 +132,14 @@ class PhaseLine:
         error: Its standard error by noise.
         deviation_rad: Root mean square of the phases about it, weighted.
         phases_rad: The phases, unwrapped along the chain, shape (m,).
+        straight: Whether noise explains how far the phases are off it.
     """
 
     slope: Estimate
     error: float
     deviation_rad: float
     phases_rad: FloatArray
+    straight: bool
 
 
 def phase_line(
@@ -166,11 +169,35 @@ def phase_line(
     # d kappa = contrast (Im(da / a) + 2 left Re(da / a)): amplitudes are the weights.
     noise = motion.error(contrast * (2 * left - 1j) / motion.amplitudes)
     error = float(np.hypot(noise, motion.turn(contrast)))
-    half = float(
-        np.hypot(t_factor(motion.dof) * error, _misfit(contrast * left, noise, motion.dof))
-    )
-    interval = around(slope, half)
-    return PhaseLine(Estimate(slope, interval), error, float(weight @ left**2) ** 0.5, phase)
+    misfit = _misfit(contrast * left, noise, motion.dof)
+    interval = around(slope, float(np.hypot(t_factor(motion.dof) * error, misfit)))
+    deviation_rad = float(weight @ left**2) ** 0.5
+    return PhaseLine(Estimate(slope, interval), error, deviation_rad, phase, misfit == 0)
+
+
+def local_wave_numbers(
+    motion: Oscillation, index: FloatArray, phases_rad: FloatArray
+) -> list[Estimate]:
+    """Return the wave number between each joint and the next [rad/joint].
+
+    Args:
+        motion: m joints with known phases.
+        index: Number of each in the chain, shape (m,).
+        phases_rad: Their unwrapped phases, shape (m,).
+
+    Returns:
+        m - 1 estimates, each with its own 95 % interval; empty where noise leaves the lag open.
+    """
+    numbers: list[Estimate] = []
+    for k, joints in enumerate(np.diff(index).tolist()):
+        lag, _ = phase_lag(motion, k + 1, k)
+        if lag.value is None or lag.ci95 is None:
+            numbers.append(Estimate())
+            continue
+        half = (lag.ci95[1] - lag.ci95[0]) / 2
+        number = float(phases_rad[k] - phases_rad[k + 1]) / joints
+        numbers.append(Estimate(number, around(number, half / joints)))
+    return numbers
 
 
 def _misfit(shares: FloatArray, noise: float, dof: float) -> float:
@@ -376,6 +403,9 @@ def _body_wave(
         metres = wave_speed(phase_line(motion, index, places).slope, omega)
     slope, (low, high) = line.slope.value or 0.0, absolute(line.slope.ci95 or (0.0, 0.0))
     turns = float(index[-1] - index[0]) / (2 * np.pi)
+    travelling = travelling_index(motion)[0]
+    travels = travelling.ci95 is not None and travelling.ci95[0] > 0
+    bent = travels and not line.straight and line.deviation_rad >= ANGLE_MARGIN_RAD
     return BodyWave(
         plane=None,
         joints=tuple(names),
@@ -383,9 +413,18 @@ def _body_wave(
         waves=Estimate(abs(slope) * turns, (low * turns, high * turns)),
         speed=wave_speed(line.slope, omega),
         speed_m_s=metres,
-        travelling_index=travelling_index(motion)[0],
+        travelling_index=travelling,
         deviation_rad=line.deviation_rad,
+        local=_local(motion, index, line.phases_rad, names) if bent else (),
     )
+
+
+def _local(
+    motion: Oscillation, index: FloatArray, phases_rad: FloatArray, names: Sequence[str]
+) -> tuple[LocalWaveNumber, ...]:
+    numbers = local_wave_numbers(motion, index, phases_rad)
+    pairs = zip(pairwise(names), numbers, strict=True)
+    return tuple(LocalWaveNumber(*joints, number) for joints, number in pairs)
 
 
 def absolute(ends: Interval) -> Interval:

@@ -173,12 +173,17 @@ def _of_quantity(
 
     Joints without an error in one of them are left out.
     """
-    tables = [pivoted(joints, column_of) for column_of in (values, *_errors(quantity, joints))]
-    if any(table is None for table in tables):
+    every = [pivoted(joints, column_of) for column_of in (values, *_errors(quantity, joints))]
+    tables = [table for table in every if table is not None]
+    if len(tables) < len(every):
         return []
     value, error, dof = (table.reindex(paths) for table in tables)
     whole = [name for name in value if value[name].notna().all() and error[name].notna().all()]
-    rates = joints.groupby("joint")["command_speed_rad_s"].max() if quantity == "delay" else {}
+    rates: Mapping[str, float] = (
+        joints.groupby("joint")["command_speed_rad_s"].max().to_dict()
+        if quantity == "delay"
+        else {}
+    )
     if not whole:
         return []
     sizes, within, freedom = (table[whole].to_numpy(float) for table in (value, error, dof))
@@ -226,7 +231,8 @@ def _errors(quantity: str, joints: Frame) -> tuple[Frame, Frame]:
         if quantity == "offset":
             larger = larger.where(middle.notna())
         error = error.fillna(larger)
-    factors = dof.map(lambda value: t_factor(float(value)) if value > 0 else np.nan)
+    numbers: list[float] = dof.to_list()
+    factors = [t_factor(value) if value > 0 else np.nan for value in numbers]
     return error / factors, dof
 
 

@@ -27,13 +27,14 @@ FEWEST_JOINTS = 3
 def values_of(joints: Frame, sessions: Frame) -> dict[str, Frame]:
     """Return the values of each quantity, one a row of ``joints``; NaN where there is none."""
     gain = column(joints, "gain").fillna(column(joints, "tracking_gain"))
-    return {
+    values: dict[str, Frame] = {
         "gain": np.log(gain.where(gain > 0)),
         "lag": column(joints, "lag_rad"),
         "delay": column(joints, "tracking_lag_s"),
         "offset": _offsets(joints),
         "energy": _log_power(joints, sessions),
     }
+    return values
 
 
 def column(joints: Frame, name: str) -> Frame:

@@ -14,6 +14,7 @@ from ..results.frequency_response import (
     JointFrequencyResponse,
     JointMotion,
     JointTracking,
+    LocalWaveNumber,
 )
 from .tables import Column, Ends, Quantity, Table, typical
 
@@ -151,6 +152,25 @@ def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
         Column(f"{lag}° (95 %)", f"{lag} [°]", lambda one: degrees(one.lag_rad), angle),
     ]
     return Table(columns, found)
+
+
+def local_waves_table(waves: Sequence[BodyWave]) -> Table[LocalWaveNumber]:
+    """Return wave numbers between neighbouring joints, of waves whose phases are on no line."""
+    columns: list[Column[LocalWaveNumber]] = [
+        Column("from", "from", lambda part: part.joint, kind="word"),
+        Column("to", "to", lambda part: part.next_joint, kind="word"),
+        Column(
+            "°/joint (95 %)",
+            "local wave number [°/joint]",
+            lambda part: degrees(part.wave_number),
+            typical(2, 4),
+        ),
+    ]
+    about = {
+        "local wave number [°/joint]": "lag of a joint behind the one before it, over the joints "
+        "between them; of phases that are on no line"
+    }
+    return Table(columns, [part for wave in waves for part in wave.local], about=about)
 
 
 def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:

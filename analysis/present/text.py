@@ -23,6 +23,7 @@ from . import tables
 from .response_tables import (
     frequency_table,
     gait_table,
+    local_waves_table,
     motion_table,
     tracking_table,
     wave_table,
@@ -251,6 +252,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         shown = [motion_table(analysis.free_motion.joints)]
         if analysis.free_motion.waves:
             shown.append(wave_table(analysis.free_motion.waves))
+        if any(wave.local for wave in analysis.free_motion.waves):
+            shown.append(local_waves_table(analysis.free_motion.waves))
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
     if any(one.value is not None for one in analysis.heterogeneity.values()):

@@ -502,7 +502,11 @@ def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
 
 
 def _motion_dict(motion: FreeMotion) -> dict[str, Any]:
-    waves = [_record(one) | {"direction": one.direction} for one in motion.waves]
+    waves = [
+        _record(wave)
+        | {"direction": wave.direction, "local": [_record(part) for part in wave.local]}
+        for wave in motion.waves
+    ]
     return {"joints": [_record(one) for one in motion.joints], "waves": waves}
 
 

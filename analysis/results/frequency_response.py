@@ -176,6 +176,22 @@ class JointMotion:
 
 
 @dataclass(frozen=True)
+class LocalWaveNumber:
+    """The wave number between two neighbouring joints.
+
+    Attributes:
+        joint: The first of both in the chain.
+        next_joint: The second.
+        wave_number: Lag of the second behind the first, over the joints between them [rad/joint];
+            empty where noise leaves it open.
+    """
+
+    joint: str
+    next_joint: str
+    wave_number: Estimate
+
+
+@dataclass(frozen=True)
 class BodyWave:
     """The wave that runs along the joints of one plane.
 
@@ -190,6 +206,8 @@ class BodyWave:
         travelling_index: 1 of a purely travelling, 0 of a standing wave: the smaller over the
             larger semi-axis of the complex amplitudes (Feeny, J. Sound and Vibration 310, 2008).
         deviation_rad: Root mean square of the phases about the line, weighted by amplitude.
+        local: Wave numbers along the body, where the phases are off a line by more than noise and
+            by a degree at least; else, and of a standing wave, empty.
     """
 
     plane: str | None
@@ -200,6 +218,7 @@ class BodyWave:
     speed_m_s: Estimate
     travelling_index: Estimate
     deviation_rad: float
+    local: tuple[LocalWaveNumber, ...] = ()
 
     @property
     def direction(self) -> str:

@@ -21,6 +21,7 @@ from undulog.capture.judgement.naming import NAMED
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, Artefact, NotFollowing, Shape, StandOut, Verdict
+from ..results.estimate import Estimate
 from ..results.frequency_response import (
     BodyWave,
     FreeMotion,
@@ -311,8 +312,23 @@ def _wave(wave: BodyWave) -> str:
         return f"the {plane}wave stands, as far as noise shows (travelling index {index})"
     return (
         f"a {plane}wave runs from {plain(first)} to {plain(last)}, "
-        f"{formats.estimate(wave.waves)} wavelengths between them, travelling index {index}"
+        f"{formats.estimate(wave.waves)} wavelengths between them{_uneven(wave)}, travelling "
+        f"index {index}"
     )
+
+
+def _uneven(wave: BodyWave) -> str:
+    """Return between which wave numbers a wave changes along the body; empty for an even one."""
+    numbers = [part.wave_number for part in wave.local if part.wave_number.value is not None]
+    if not numbers:
+        return ""
+    ends = [min(numbers, key=_size_of), max(numbers, key=_size_of)]
+    least, most = (formats.estimate(formats.degrees(number), "") for number in ends)
+    return f" and no even one (from {least} to {most} °/joint)"
+
+
+def _size_of(number: Estimate) -> float:
+    return number.value or 0.0
 
 
 def _swept(found: Sequence[JointFrequencyResponse], tracking: Sequence[JointTracking]) -> str:

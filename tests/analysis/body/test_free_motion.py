@@ -1,11 +1,13 @@
 """Waves along chains whose motion is known in closed form, with white noise on every joint."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.analysis.body.free_motion import fit_motion, free_motion
+from undulog.analysis.body.free_motion import fit_motion, free_motion, local_wave_numbers
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
@@ -126,6 +128,32 @@ def test_a_wave_number_holds_how_far_phases_are_off_a_line():
     low, high = straight.wave_number.ci95
     assert high - low < 0.01
     assert wave.direction == straight.direction == "first-to-last"
+
+
+def test_a_wave_that_is_no_even_one_has_wave_numbers_along_the_body():
+    """The steps from joint to joint are known."""
+    truth = np.linspace(0.3, 1.1, 9)
+    amplitudes = 0.3 * np.exp(-1j * np.concatenate(([0.0], np.cumsum(truth))))
+    names, held = [f"joint{k:02d}" for k in range(1, 11)], 0
+    for seed in range(20):
+        (wave,) = measured(chain(amplitudes, noise=NOISE, seed=seed))[1].waves
+        assert [(part.joint, part.next_joint) for part in wave.local] == [*pairwise(names)]
+        ends = [part.wave_number.ci95 for part in wave.local]
+        held += sum(low <= step <= high for (low, high), step in zip(ends, truth, strict=True))
+    assert held >= 0.90 * 180  # neighbours share a joint: less than 180 independent ones
+    for even in (0.3 * np.exp(-0.65j * np.arange(10)), 0.4 * np.cos(0.6 * np.arange(10) + 1) + 0j):
+        (wave,) = measured(chain(even, noise=NOISE))[1].waves
+        assert wave.local == ()
+
+
+def test_the_place_of_a_joint_that_is_left_out_counts():
+    steps = np.array([0.3, 0.5, 1.2, 0.7])
+    phases = -np.concatenate(([0.0], np.cumsum(steps)))
+    series = chain(0.3 * np.exp(1j * phases), noise=NOISE)
+    motion = fit_motion(series, measured(series)[0]).oscillation
+    index = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
+    numbers = local_wave_numbers(motion, index, phases)
+    assert [one.value for one in numbers] == pytest.approx([0.3, 0.5, 0.6, 0.7])
 
 
 def test_a_joint_at_rest_has_no_phase_and_the_wave_goes_on_behind_it():
