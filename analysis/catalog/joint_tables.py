@@ -39,9 +39,8 @@ def values_of(joints: Frame, sessions: Frame) -> dict[str, Frame]:
 
 def column(joints: Frame, name: str) -> Frame:
     """Return a column as numbers; NaN where rows of an earlier version lack it."""
-    if name not in joints:
-        return pd.Series(np.nan, joints.index)
-    return pd.to_numeric(joints[name])
+    values: list[float] = joints[name].to_list() if name in joints else [np.nan] * len(joints)
+    return pd.Series(values, joints.index, np.float64)
 
 
 def _offsets(joints: Frame) -> Frame:
