@@ -18,6 +18,7 @@ from ..results.body import BodyShape, GroundContact, PlaneShape
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
 from ..results.estimate import Estimate
+from ..results.frequency_response import FreeMotion
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
 from .response_tables import (
@@ -249,11 +250,7 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         shown = shown if analysis.tracking else []
         shown.append(frequency_table(analysis.frequency_response))
     if analysis.free_motion is not None and analysis.free_motion.joints:
-        shown = [motion_table(analysis.free_motion.joints)]
-        if analysis.free_motion.waves:
-            shown.append(wave_table(analysis.free_motion.waves))
-        if any(wave.local for wave in analysis.free_motion.waves):
-            shown.append(local_waves_table(analysis.free_motion.waves))
+        shown = _of_motion(analysis.free_motion)
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
     if any(one.value is not None for one in analysis.heterogeneity.values()):
@@ -272,6 +269,16 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print(_method(analysis), "dim")
     sheet.lines((f"Note: {note}" for note in analysis.notes), "dim")
     return sheet.text()
+
+
+def _of_motion(motion: FreeMotion) -> list[tables.AnyTable]:
+    """Return the tables of a motion without commands."""
+    shown: list[tables.AnyTable] = [motion_table(motion.joints)]
+    if motion.waves:
+        shown.append(wave_table(motion.waves))
+    if any(wave.local for wave in motion.waves):
+        shown.append(local_waves_table(motion.waves))
+    return shown
 
 
 def _method(analysis: Analysis) -> str:
