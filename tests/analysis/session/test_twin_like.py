@@ -199,7 +199,8 @@ def test_a_change_of_gait_splits_the_session(tmp_path):
     result = analysed(path)
     # 2 to 10 s are four cycles; from 10 s on it settles for 2 s and leaves five.
     assert result.gait.fitted.start_s == pytest.approx(12.0)
-    assert any("the gait parameters change" in text for text in result.warnings)
+    assert any("the gait changes: of 2 windows" in text for text in result.warnings)
+    assert [round(gait.start_s) for gait in result.gaits] == [2, 12]
     assert result.joints[0].command_amplitude_rad == pytest.approx(0.24)
     first = analysed(path, Options(stop_s=10.0))
     assert first.joints[0].command_amplitude_rad == pytest.approx(0.3)
