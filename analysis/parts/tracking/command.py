@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from undulog.capture.common.arrays import FloatArray
 
@@ -75,19 +76,33 @@ class Command:
         """
         if a <= 0:
             return self.at(t_s - d)
-        from scipy.signal import lfilter, lfiltic
-
         of_mean, of_rise, denominator = _discrete(a, q, self._step_s)
         inputs = np.zeros(self._nodes.size)
         for k in range(1, of_mean.size):
             inputs[k:] += of_mean[k] * self._means[: inputs.size - k]
             inputs[k:] += of_rise[k] * self._rises[: inputs.size - k]
         # Before the first node all was at rest at the first command.
-        rest = np.full(denominator.size - 1, self._means[0])
         inputs[: of_mean.size] += self._means[0] * (of_mean.sum() - np.cumsum(of_mean))
-        state = lfiltic([1.0], denominator, rest)
-        output = np.asarray(lfilter([1.0], denominator, inputs, zi=state)[0], dtype=np.float64)
+        output = _recursion(denominator, inputs, rest=float(self._means[0]))
         return _between((t_s - d - self._nodes[0]) / self._step_s, output)
+
+
+def _recursion(denominator: FloatArray, inputs: FloatArray, rest: float) -> FloatArray:
+    """Return y_n = x_n - a_1 y_(n-1) - ... - a_k y_(n-k), as LAPACK solves a banded triangle.
+
+    ``scipy.signal.lfilter`` does the same; its package takes most of a second to import.
+
+    Args:
+        denominator: 1, a_1, ..., a_k, shape (k + 1,).
+        inputs: x, shape (n,).
+        rest: y before the first.
+    """
+    known = inputs.copy()
+    for k in range(1, denominator.size):
+        known[:k] -= rest * denominator[k]
+    bands = np.repeat(denominator[:, np.newaxis], inputs.size, axis=1)
+    solution, _ = dtbtrs(bands, known, uplo="L", diag="U")  # never singular
+    return np.asarray(solution, dtype=np.float64).ravel()
 
 
 def _between(index: FloatArray, values: FloatArray) -> FloatArray:
