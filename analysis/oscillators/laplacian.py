@@ -30,7 +30,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eig
-from scipy.optimize import linear_sum_assignment
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
@@ -163,6 +162,8 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
 
 def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
     """Return another draw's rates in the order of these."""
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, when it is needed
+
     _, order = linear_sum_assignment(np.abs(rates[:, None] - others[None, :]))
     return others[order]
 

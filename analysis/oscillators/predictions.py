@@ -33,7 +33,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import toeplitz
-from scipy.optimize import brentq
 from scipy.special import stdtridf, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
@@ -157,6 +156,8 @@ def explicit_coupling(P: FloatArray, rate: float = STRONG) -> float | None:
         I - P + K L has this rate, L the path's Laplacian; 0 where none is needed, None where none
         is enough.
     """
+    from scipy.optimize import brentq  # a quarter of a second, when it is needed
+
     L = path_laplacian(len(P))
 
     def lacking(K: float) -> float:

@@ -19,7 +19,6 @@ from enum import StrEnum
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ..common.arrays import FloatArray
 from ..common.errors import some_names
@@ -254,6 +253,8 @@ def _as_good(one: Explanation, best: Explanation) -> bool:
 
 def _candidates(pairs: Pairs) -> list[Explanation]:
     """Return the names as they are, then the best order of each delay, each at its best delay."""
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, when it is needed
+
     count = pairs.judged.size
     favoured = pairs.explained + AS_GOOD * np.eye(count)
     orders: dict[tuple[int, ...], None] = {tuple(range(count)): None}
