@@ -1,0 +1,1 @@
+"""Episodes of a data set for learning, compared with each other."""

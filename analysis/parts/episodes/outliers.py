@@ -1,0 +1,122 @@
+"""Which episodes differ from the others by more than their scatter and their errors explain.
+
+A value's deviation from the mean of the others, over their standard deviation, has Student's
+distribution (Grubbs, Technometrics 11, 1969, doi 10.1080/00401706.1969.10490657). The values are
+taken in the order of their deviation from the median, and all from the first on that stands out
+against those before it do so, as several hide each other (Rosner, Technometrics 25, 1983, doi
+10.2307/1268549). Values that are the largest of many have Gumbel's distribution, whose upper tail
+is longer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.judgement.levels import ENOUGH_LIKE, ROBUST, TINY, WHOLE
+
+ROUNDS = 12
+"""Steps of the scatter's bisection: to a part in 4,000."""
+
+FURTHEST = 1e6
+"""Standard deviations beyond which it doesn't matter how far a value is out."""
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Deviations of e episodes in q quantities, shape (e, q) each; NaN where nothing is known.
+
+    Attributes:
+        deviation: From the mean of the others.
+        half: Half of the interval that sound ones have at the level of all tests.
+        error: Standard deviation of a sound one, with its own error.
+        outside: Whether it stands out.
+    """
+
+    deviation: FloatArray
+    half: FloatArray
+    error: FloatArray
+    outside: BoolArray
+
+
+def outliers_of(
+    values: FloatArray,
+    errors: FloatArray,
+    margins: FloatArray | float,
+    level: float,
+    *,
+    largest: bool = False,
+) -> Outliers:
+    """Find the values that stand out in their column.
+
+    Args:
+        values: Shape (e, q); NaN where nothing is known.
+        errors: Standard errors, shape (e, q).
+        margins: A deviation that matters, (e, q) or what broadcasts to it.
+        level: Chance that any of the values stands out where none should.
+        largest: Whether the values are maxima.
+    """
+    count = np.isfinite(values).sum(axis=0)
+    middle = median_of(values)
+    spread = np.sqrt(scatter_of(values - middle, errors) ** 2 + errors**2) + TINY
+    scaled = np.clip((values - middle) / spread, -FURTHEST, FURTHEST)
+    ranked = np.take_along_axis(scaled, np.argsort(np.abs(scaled), axis=0), axis=0)  # NaN last
+    mean, deviation = _before(np.nan_to_num(ranked))
+    before = np.arange(len(values) + 1, dtype=np.float64)[:, None]
+    factor = _factors(before, level / max(int(count.sum()), 1), largest=largest)
+    limits = factor * deviation * np.sqrt(1 + 1 / np.maximum(before, 1))
+    eligible = (before >= np.maximum(WHOLE * count, ENOUGH_LIKE - 1)) & (before < count)
+    stands = eligible[:-1] & (np.abs(ranked - mean[:-1]) > limits[:-1])
+    sound = np.where(stands.any(axis=0), stands.argmax(axis=0), count)[None, :]
+    sound_mean, limit, sd = (
+        np.take_along_axis(array, sound, axis=0) for array in (mean, limits, deviation)
+    )
+    size, half = (scaled - sound_mean) * spread, limit * spread
+    known = np.isfinite(size) & (count >= ENOUGH_LIKE)
+    outside = known & (np.abs(size) > np.maximum(half, margins))
+    return Outliers(size, half, np.maximum(sd, TINY) * spread, outside)
+
+
+def _before(ranked: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and standard deviation of the values before each place, shape (e + 1, q)."""
+    none = np.zeros_like(ranked[:1])
+    sums = np.concatenate([none, np.cumsum(ranked, axis=0)])
+    squares = np.concatenate([none, np.cumsum(ranked**2, axis=0)])
+    count = np.arange(len(ranked) + 1, dtype=np.float64)[:, None]
+    mean = sums / np.maximum(count, 1)
+    variance = (squares - count * mean**2) / np.maximum(count - 1, 1)
+    return mean, np.sqrt(np.maximum(variance, 0.0))
+
+
+def _factors(before: FloatArray, tail: float, *, largest: bool) -> FloatArray:
+    """Return standard deviations of which a sound value is beyond with a chance of the tail."""
+    student = np.asarray(stdtrit(np.maximum(before - 1, 1), 1 - tail / 2), dtype=np.float64)
+    if not largest:
+        return student
+    gumbel = (-np.log(tail) - np.euler_gamma) * np.sqrt(6) / np.pi
+    return np.maximum(student, gumbel)
+
+
+def median_of(values: FloatArray) -> FloatArray:
+    """Return the median of each column, 0 where nothing is known, shape (q,)."""
+    known = np.isfinite(values).any(axis=0)
+    return np.nan_to_num(np.nanmedian(np.where(known, values, 0.0), axis=0))
+
+
+def scatter_of(deviations: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return the standard deviation that values have besides their errors, shape (q,).
+
+    With it half of the deviations are within the median of a normal distribution; it is 0 where
+    the errors explain as much.
+    """
+    size = np.abs(deviations)
+    high = ROBUST * median_of(size)
+    low = np.zeros_like(high)
+    for _ in range(ROUNDS):
+        middle = (low + high) / 2
+        more = ROBUST * median_of(size / (np.hypot(middle, errors) + TINY)) > 1
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return low
