@@ -19,6 +19,8 @@ from undulog.capture.common.console import Progress, echo, emit_json, output_wid
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import check_output, write_text
 
+from .data_set import is_data_set, show_data_set
+
 if TYPE_CHECKING:
     from undulog.capture import SessionView
 
@@ -48,12 +50,15 @@ def analyse(
     where they have other names. The first line printed is the answer; the method comes last.
     Several sessions are one experiment: runs of a gait and of its reverse separate boundary from
     module. A folder, a pattern, or `--each` give a table instead, a line for each session; one that
-    fails stops none.
+    fails stops none. The folder of a LeRobot data set gives a table of its episodes, worst first,
+    and a list of those to leave out.
     The glossary of the manual, also at the end of each report, defines the words of results.
 
     Example: `undulog analyse run.mcap --json -o run.json`
 
     For a spreadsheet: `undulog analyse runs/ --csv joints.csv`
+
+    A data set for learning: `undulog analyse DATASET --csv episodes.csv`
 
     Args:
         files: Sessions (MCAP), or their URLs; several are runs of one experiment. Folders of
@@ -76,12 +81,18 @@ def analyse(
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
     options = chosen(start, stop, topics, reference_topic, excitation_topic)
+    if any(is_data_set(file) for file in files):
+        _check_data_set(files, options, [null, robot, each or None])
     paths = sessions_of(files)
     if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
     if output is not None:
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
+    if is_data_set(files[0]):
+        if csv is not None:
+            check_output(csv, (".csv",), "the table of episodes is a CSV file", force=force)
+        return show_data_set(files[0], output, csv, as_json=json)
     one_by_one = len(paths) > 1 and (each or not are_as_given(paths, files))
     if csv is not None:
         from ..present.data_frames import check_csv
@@ -114,6 +125,23 @@ def analyse(
 
     show(text, output)
     return 0
+
+
+def _check_data_set(files: Sequence[Path], options: Options, others: Sequence[object]) -> None:
+    """Refuse what isn't for a data set.
+
+    Raises:
+        UsageError: If there are several paths, or options of sessions.
+    """
+    from ..signals.stretch import Options
+
+    if len(files) > 1:
+        raise UsageError("a LeRobot data set is analysed alone: give one folder")
+    if options != Options() or any(other is not None for other in others):
+        raise UsageError(
+            f"{files[0]} is a LeRobot data set: of the options --json, --output, --csv and --force "
+            "are for it; undulog import makes a session of each episode"
+        )
 
 
 def _one(file: Path, options: Options, null: Path | None, robot: str | None) -> Analysis:

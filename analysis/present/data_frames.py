@@ -381,9 +381,18 @@ def write_csv(
     for file in files:
         refuse_existing(file, force=force)
     for file, frame in files.items():
-        with part_file(file) as part:
-            _write(frame, part)
+        write_frame(frame, file)
     return list(files)
+
+
+def write_frame(frame: pd.DataFrame, file: Path) -> None:
+    """Write a table as CSV; what is there is replaced.
+
+    Raises:
+        LogWriteError: If it can't be written.
+    """
+    with part_file(file) as part:
+        _write(frame, part)
 
 
 def _write(frame: pd.DataFrame, path: Path) -> None:

@@ -57,6 +57,7 @@ class LeRobotDataset:
         fps: Frames a second.
         names: Feature to the names of its elements.
         left_out: Features that are not imported.
+        numbering: Features that number the frames.
         reader: Reads its files.
     """
 
@@ -66,6 +67,7 @@ class LeRobotDataset:
     fps: float
     names: Mapping[str, tuple[str, ...]]
     left_out: tuple[str, ...]
+    numbering: tuple[str, ...] = ()
     reader: ParquetReader = field(default_factory=ParquetReader, repr=False, compare=False)
 
     def files(self) -> list[Path]:
@@ -82,7 +84,7 @@ class LeRobotDataset:
         for path in self.files():
             numbers, most = set[int](), path.stat().st_size // _LEAST_EPISODE
             for block in self.reader.blocks(path, ["episode_index"], _ROWS):
-                numbers.update(np.unique(_integers(path, block, "episode_index")).tolist())
+                numbers.update(np.unique(integers(path, block, "episode_index")).tolist())
                 if len(numbers) > most:
                     refuse(path, f"numbers over {most} episodes, more than its bytes can hold")
             for episode in numbers:
@@ -113,6 +115,7 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         names = {name: _element_names(features[name]) for name in FEATURES if name in features}
         version, kind = str(info.get("codebase_version", "")), str(info.get("robot_type") or "")
         others = tuple(n for n in features if n not in FEATURES and n not in _KNOWN)
+        numbering = tuple(n for n in features if n in _KNOWN)
     except LogError:
         raise
     except (
@@ -121,7 +124,7 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         raise ImportFormatError(path, f"is no description of a LeRobot dataset: {error}") from error
     if not names or not 1e-3 <= fps <= 1e6:
         raise ImportFormatError(path, "names neither action nor observation.state, or no fps")
-    return LeRobotDataset(folder, version, kind, fps, names, others)
+    return LeRobotDataset(folder, version, kind, fps, names, others, numbering)
 
 
 def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
@@ -145,7 +148,7 @@ def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(plain) if len(set(plain)) == count else tuple(numbered("joint", count))
 
 
-def _integers(path: Path, block: Block, name: str) -> NDArray[Any]:
+def integers(path: Path, block: Block, name: str) -> NDArray[Any]:
     """Return a column of frame or episode numbers."""
     numbers = block[name]
     if numbers.dtype.kind not in "iu" or numbers.ndim != 1:
@@ -257,7 +260,7 @@ def _frames(path: Path, dataset: LeRobotDataset, number: int, rows: int) -> Iter
     """Yield the frames of one episode in a file; only row groups that hold some are read."""
     where = "episode_index", number
     for vectors in dataset.reader.blocks(path, [*dataset.names, "frame_index"], rows, where=where):
-        frame = _integers(path, vectors, "frame_index")
+        frame = integers(path, vectors, "frame_index")
         block: Block = {"time": np.rint(frame * (NS / dataset.fps)).astype(np.int64)}
         for name, names in dataset.names.items():
             elements = vectors_of(vectors[name])

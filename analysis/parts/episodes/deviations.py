@@ -34,6 +34,8 @@ class Deviations:
         gain_unit: Standard error of the gain for a residual of 1.
         lag_unit: Standard error of the lag for a residual of 1, times the gain [frames].
         left: Mean square of the residual.
+        power: Variance of the states.
+        asked: Variance of x.
         count: Frames that are used.
     """
 
@@ -44,6 +46,8 @@ class Deviations:
     gain_unit: FloatArray
     lag_unit: FloatArray
     left: FloatArray
+    power: FloatArray
+    asked: FloatArray
     count: FloatArray
 
     @classmethod
@@ -97,6 +101,8 @@ def regress(block: Block, response: Response) -> Regression:
         gain_unit=np.sqrt(1 / xx + (dx / xx) ** 2 / free),
         lag_unit=1 / np.sqrt(free),
         left=dot(residual, residual) / count,
+        power=dot(y, y) / count,
+        asked=xx / count,
         count=np.broadcast_to(count, gain.shape),
     )
     return Regression(deviations, weights, raw, (x, late), residual)

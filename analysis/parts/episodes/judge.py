@@ -10,19 +10,20 @@ times.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD, HALF, QUARTER, TINY, WIDTH
+from undulog.capture.common.errors import some_names
+from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD, ENOUGH_LIKE, FULL, HALF, QUARTER, REST_ERRORS, TINY, WIDTH
 
 from .deviations import Deviations, refined
 from .jumps import Jumps
-from .outliers import Outliers, median_of, outliers_of, scatter_of
+from .outliers import Outliers, median_of, outliers_of, scatter_of, weighted_median
 from .pace import pace_of
-from .record import Record, block_of
+from .record import Block, Record, block_of
 from .response import Response
 from .result import EpisodeFault
 
@@ -33,6 +34,10 @@ FAMILIES = 8
 """Of questions: gain, lag, offset, the lag in common, lost frames, doubled ones, states that stand,
 commands that stand."""
 
+MOST_OFTEN = 2
+"""Episodes, or a tenth of all, that may have the same fault: more are a group of their own, as of
+another task, and no fault."""
+
 LIKELY = 0.05
 """Level from which a joint is looked at again, frame by frame."""
 
@@ -42,6 +47,9 @@ GAIN_MATTERS = 0.05
 LAG_MATTERS = HALF
 """Of a lag [frames]: a policy sees whole ones."""
 
+LEFT = 2.0
+"""Root mean squares of a sound residual that a deviation's root mean square exceeds."""
+
 RATE_MATTERS = 0.03
 """Of a rate."""
 
@@ -50,6 +58,9 @@ SCALED = 2.0
 
 SEARCHED_S = 0.35
 """Lags on either side of the common one that are searched [s]."""
+
+TOGETHER = 16
+"""Episodes that are searched at once: they are a block in memory."""
 
 WORSE = float(np.log(2.0))
 """What is left is this much more (of its logarithm) where an episode is looked at again."""
@@ -64,6 +75,7 @@ class Measured:
 
     Attributes:
         used: Indices of the episodes that are compared, shape (u,); all arrays are of these.
+        sample: Some of the episodes, from which the response was fitted.
         inflation: Of the variances of level, gain and lag, shape (3, m).
         frozen: Motion of the command while the state stands, shape (u, m).
         unasked: Motion of the state while the command stands, shape (u, m).
@@ -72,6 +84,7 @@ class Measured:
     record: Record
     used: IntArray
     response: Response
+    sample: Block
     deviations: Deviations
     inflation: FloatArray
     jumps: Jumps
@@ -79,8 +92,10 @@ class Measured:
     unasked: FloatArray
 
 
-def faults_of(measured: Measured, unit: str, margin: float) -> list[EpisodeFault]:
-    """Return what is wrong, worst first.
+def faults_of(
+    measured: Measured, unit: str, margin: float
+) -> tuple[list[EpisodeFault], list[str]]:
+    """Return what is wrong, worst first, and what isn't decided.
 
     Args:
         unit: Of the states.
@@ -98,18 +113,27 @@ def faults_of(measured: Measured, unit: str, margin: float) -> list[EpisodeFault
         for fault in judge.joints(skipped)
         if (fault.episode, fault.joint) not in named
     ]
-    return sorted(faults, key=lambda fault: (-fault.times, fault.episode))
+    ranked = sorted(faults, key=lambda fault: (-(fault.times or 0.0), fault.episode))
+    return ranked, [*judge.limits, *judge.unknown()]
 
 
 def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return gain (a factor less 1), lag [frames] and offset of each joint, and their errors."""
+    """Return gain (a factor less 1), lag [frames] and offset of each joint, and their errors.
+
+    Gain and lag are known where a joint had to move by more than what its model leaves of sound
+    episodes, and where it follows at all.
+    """
     d = measured.deviations
     usual = median_of(d.gain)
     usual = np.where(np.abs(usual) > TINY, usual, 1.0)
-    noise = np.sqrt(median_of(d.left) * measured.inflation)  # level, gain, lag
+    left = median_of(d.left)
+    noise = np.sqrt(left * measured.inflation)  # level, gain, lag
+    farthest = SEARCHED_S * measured.record.fps
+    asked = usual**2 * d.asked >= REST_ERRORS**2 * left
+    follows = asked & (d.left <= HALF * d.power)
     values = {
-        "gain": d.gain / usual - 1,
-        "lag": d.lag,
+        "gain": np.where(follows, d.gain / usual - 1, np.nan),
+        "lag": np.where(follows & (np.abs(d.lag) < farthest), d.lag, np.nan),
         "offset": d.mean - usual * d.middle,
     }
     errors = {
@@ -130,11 +154,11 @@ def _search_again(measured: Measured) -> None:
     again = np.flatnonzero(likely.any(axis=1))
     if again.size:
         most = max(int(np.ceil(SEARCHED_S * measured.record.fps)), 1)
-        search = replace(measured.record)
-        for index in again.tolist():
+        for first in range(0, again.size, TOGETHER):
+            indices = again[first : first + TOGETHER]
             refined(
-                search, measured.response, measured.deviations,
-                np.array([index]), measured.used[[index]], most,
+                measured.record, measured.response, measured.deviations,
+                indices, measured.used[indices], most,
             )  # fmt: skip
 
 
@@ -145,6 +169,18 @@ class _Judge:
         self._m, self._unit, self._margin = measured, unit, margin
         self._values, self._errors = values_of(measured)
         self._level = LEVEL / FAMILIES
+        self.limits = list[str]()
+
+    def _few(self, outside: BoolArray, names: Sequence[str]) -> BoolArray:
+        """Return what stands out, without what does so in too many episodes for a fault."""
+        count = outside.sum(axis=0)
+        many = count > np.maximum(MOST_OFTEN, (1 - FULL) * len(outside))
+        self.limits += [
+            f"{names[k]}: {count[k]} of {len(outside)} episodes differ from the rest; these are "
+            "groups, and which of them is right isn't known"
+            for k in np.flatnonzero(many).tolist()
+        ]
+        return outside & ~many
 
     def _number(self, index: int) -> int:
         return int(self._m.record.numbers[self._m.used[index]])
@@ -158,8 +194,8 @@ class _Judge:
             outliers = self._largest(values[:, None], least)
             for index in np.flatnonzero(outliers.outside[:, 0] & (values > least)).tolist():
                 after = int((jumps.after if lost else jumps.twice_after)[index])
-                if lost and not jumps.lost[index] >= jumps.twice[index] * HALF:
-                    continue
+                if lost and not jumps.middle[index] > HALF:
+                    continue  # most joints don't jump
                 if not lost and not self._is_copy(index, after):
                     continue
                 times = float(values[index] / max(float(outliers.half[index, 0]), least))
@@ -236,9 +272,9 @@ class _Judge:
         error = PER_MEDIAN / np.sqrt(np.sum(weights**2, axis=1) + TINY)
         outliers = outliers_of(slower[:, None], error[:, None], RATE_MATTERS, self._level)
         later = weighted_median(off, np.where(np.isfinite(off), 1 / scatter, 0.0))
-        for index in np.flatnonzero(outliers.outside[:, 0]).tolist():
-            number = self._number(index)
-            if number not in skipped:
+        outside = self._few(outliers.outside, ["lag of all joints"])
+        for index in np.flatnonzero(outside[:, 0]).tolist():
+            if self._number(index) not in skipped:
                 yield self._shared(index, float(slower[index]), float(later[index]), outliers)
 
     def _shared(
@@ -246,48 +282,74 @@ class _Judge:
     ) -> EpisodeFault:
         record, response = self._m.record, self._m.response
         block = block_of(record, self._m.used[[index]])
-        pace = pace_of(block, response, 1 + slower, later, self._m.inflation[2])
+        pace = pace_of(block, self._m.sample, response, slower, later)
         half = max(float(outliers.half[index, 0]), RATE_MATTERS)
         times = abs(float(outliers.deviation[index, 0])) / half
         width = WIDTH * float(outliers.error[index, 0])
-        if pace.delay:
-            self._values["lag"][index] -= pace.delay
-            size = pace.delay / record.fps
-            width *= float(np.median(response.lag)) / record.fps
-            way = "later" if size > 0 else "earlier"
+        number, way = self._number(index), "more" if slower > 0 else "fewer"
+        if pace.is_rate:
+            self._values["lag"][index] -= response.lag * slower
+            rate = 1 + slower
             return EpisodeFault(
-                self._number(index), "delay", None, size, "s", (size - width, size + width),
-                times, None, f"all joints follow {abs(size) * 1e3:.0f} ms {way}",
-                "" if pace.decided else "rate",
+                number, "rate", None, rate, "", (rate - width, rate + width), times, None,
+                f"recorded at {record.fps * rate:.3g} Hz, if the others are at {record.fps:g} Hz: "
+                f"all joints lag by {abs(slower):.0%} {way} frames",
+                "" if pace.decided else "delay",
             )  # fmt: skip
-        self._values["lag"][index] -= response.lag * (pace.rate - 1)
-        hz, percent = record.fps * pace.rate, 100 * (pace.rate - 1)
+        self._values["lag"][index] -= later
+        size, width = later / record.fps, width * float(np.median(response.lag)) / record.fps
         return EpisodeFault(
-            self._number(index), "rate", None, pace.rate, "", (pace.rate - width, pace.rate + width),
-            times, None,
-            f"recorded at {hz:.3g} Hz ({percent:+.0f} %), if the others are at {record.fps:g} Hz: "
-            "all joints lag by so many more frames" if percent > 0 else
-            f"recorded at {hz:.3g} Hz ({percent:+.0f} %), if the others are at {record.fps:g} Hz: "
-            "all joints lag by so many fewer frames",
-            "" if pace.decided else "delay",
+            number, "delay", None, size, "s", (size - width, size + width), times, None,
+            f"all joints follow {abs(size) * 1e3:.0f} ms {'later' if size > 0 else 'earlier'}",
+            "" if pace.decided else "rate",
         )  # fmt: skip
+
+    def unknown(self) -> Iterator[str]:
+        """Yield which joints' gains and lags are known in too few episodes."""
+        few = np.isfinite(self._values["gain"]).sum(axis=0) < ENOUGH_LIKE
+        names = [self._m.record.names[j] for j in np.flatnonzero(few).tolist()]
+        if names:
+            yield (
+                f"gain and lag of {some_names(names, 6)}: they aren't asked to move enough, or "
+                "their states don't follow the actions"
+            )
 
     def joints(self, skipped: set[int]) -> Iterator[EpisodeFault]:
         """Yield joints whose gain, lag or offset differs."""
-        margins = {"gain": GAIN_MATTERS, "lag": LAG_MATTERS, "offset": self._margin}
+        margins = self._margins()
         outliers = {
             quantity: outliers_of(
                 self._values[quantity], self._errors[quantity], margin, self._level
             )
             for quantity, margin in margins.items()
         }
-        any_outside: BoolArray = np.logical_or.reduce([o.outside for o in outliers.values()])
+        names = self._m.record.names
+        outside = {
+            quantity: self._few(o.outside, [f"{quantity} of {name}" for name in names])
+            for quantity, o in outliers.items()
+        }
+        any_outside: BoolArray = np.logical_or.reduce([*outside.values()])
         for index, j in np.argwhere(any_outside).tolist():
             if self._number(index) in skipped:
                 continue
             # A weak joint rests off, too, and a late one seems weak: the first explains the rest.
-            quantity = next(q for q in margins if outliers[q].outside[index, j])
-            yield self._joint(index, j, quantity, outliers[quantity], margins[quantity])
+            quantity = next(q for q in margins if outside[q][index, j])
+            margin = float(margins[quantity][index, j])
+            yield self._joint(index, j, quantity, outliers[quantity], margin)
+
+    def _margins(self) -> dict[str, FloatArray]:
+        """Return what matters of gain, lag and offset, shape (u, m) each.
+
+        What a deviation makes of the motion is also more than the model leaves of sound episodes.
+        """
+        d, root = self._m.deviations, np.sqrt(self._m.deviations.count)
+        usual = np.maximum(np.abs(median_of(d.gain)), TINY)
+        left = LEFT * np.sqrt(median_of(d.left))
+        return {
+            "gain": np.maximum(GAIN_MATTERS, left * d.gain_unit * root / usual),
+            "lag": np.maximum(LAG_MATTERS, left * d.lag_unit * root / usual),
+            "offset": np.broadcast_to(np.maximum(self._margin, left), root.shape),
+        }
 
     def _joint(
         self, index: int, j: int, quantity: str, outliers: Outliers, margin: float
@@ -313,17 +375,6 @@ class _Judge:
             f"{name} {text.rstrip()} than in the other episodes"
             if kind == "delay" else f"{name}: {text.rstrip()}",
         )  # fmt: skip
-
-
-def weighted_median(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the weighted median of each row; NaN where no weight is, shape (e,)."""
-    order = np.argsort(values, axis=1)
-    ranked = np.take_along_axis(values, order, axis=1)
-    sums = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
-    total = sums[:, -1:]
-    at = (sums >= total / 2).argmax(axis=1)
-    middle = np.take_along_axis(ranked, at[:, None], axis=1)[:, 0]
-    return np.where(total[:, 0] > 0, middle, np.nan)
 
 
 def unit_of(record: Record, episodes: Sequence[int]) -> tuple[str, float]:

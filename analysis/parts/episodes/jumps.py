@@ -4,10 +4,13 @@ A frame that was lost moves all joints at once by what they go in a frame. The f
 side of a transition show a joint's rate, and its jump: that of a step beside a parabola by least
 squares. What the command explains is no loss, so the jump is that of the residual of
 :mod:`.response`. If the recorder lost a frame, it lost the command's, too, and what that does to the
-residual is known: a step less the step response. With the residual's usual jump e the time that is
-missing between two frames is, over all joints j,
+residual is known: a step less the step response. The time that is missing between two frames is,
+over all joints,
 
-    tau = sum(jump rate / e^2) / i,    i = sum(rate^2 / e^2)   [frames]                     (1)
+    tau = sum(jump rate / e^2) / i,    i = sum(rate^2 / e^2),    e^2 = s^2 + (r rate)^2     (1)
+
+in frames, where s is a joint's usual jump while it stands, and r that in parts of its rate while it
+moves: a sensor that is read more rarely than the others always jumps, and shows nothing.
 
 and a frame that is lost is more likely than none by the factor exp(u - i / 2), u = tau i. The
 statistic is its exponent over its standard error: (u - i / 2) / sqrt(i) exceeds 0 only where tau is
@@ -21,11 +24,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
-from undulog.capture.judgement.levels import TINY
+from undulog.capture.judgement.levels import HALF, TINY
 
 from .deviations import Regression
+from .outliers import weighted_median
 from .record import Block
-from .response import Response, delayed, lowpass
+from .response import Response, delayed, dot, lowpass
 
 SIDE = 4
 """Frames on either side: fewer show no parabola, with more a quick move is none."""
@@ -71,12 +75,14 @@ class JumpScale:
     """What the jumps of sound joints are.
 
     Attributes:
-        usual: Root mean square of e, shape (m,).
+        usual: s of equation (1), shape (m,).
+        relative: r of equation (1) [frames], shape (m,).
         seen: Part of a lost frame's jump, shape (m,).
         residual: Whether the residuals are looked at, or else the states.
     """
 
     usual: FloatArray
+    relative: FloatArray
     seen: FloatArray
     residual: bool
 
@@ -87,9 +93,12 @@ def scale_of(block: Block, regression: Regression, response: Response) -> JumpSc
     residual = bool(np.median(seen) > LEAST_SEEN)
     seen = np.maximum(seen, 0.0) if residual else np.ones_like(seen)
     jumps = _jumps(block, regression, residual=residual)
+    rates = windowed(block.states, RATE) * _inside(block)[:, :, None]
     count = np.maximum(_inside(block).sum(axis=0), 1)[:, None]
-    usual = np.sqrt(np.median(np.einsum("tkm,tkm->km", jumps, jumps) / count, axis=0))
-    return JumpScale(usual, seen, residual)
+    usual = np.median(dot(jumps, jumps) / count, axis=0)
+    power = rates**2
+    relative = np.median(dot(jumps**2, power) / (dot(power, power) + TINY), axis=0)
+    return JumpScale(np.sqrt(usual), np.sqrt(relative), seen, residual)
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,7 @@ class Jumps:
         after: The frame before which it is.
         time: tau of the states there [frames].
         error: Its standard error [frames].
+        middle: The median of the joints' times [frames], weighted by what each shows.
         twice: The largest statistic of a frame that is there twice.
         twice_after: The frame before that.
     """
@@ -109,15 +119,16 @@ class Jumps:
     after: IntArray
     time: FloatArray
     error: FloatArray
+    middle: FloatArray
     twice: FloatArray
     twice_after: IntArray
 
     @classmethod
     def empty(cls, episodes: int) -> Jumps:
         """Return what no frame is looked at for."""
-        none = [np.full(episodes, np.nan) for _ in range(4)]
+        none = [np.full(episodes, np.nan) for _ in range(5)]
         numbers = [np.zeros(episodes, np.int64) for _ in range(2)]
-        return cls(none[0], numbers[0], none[1], none[2], none[3], numbers[1])
+        return cls(none[0], numbers[0], *none[1:], numbers[1])
 
     def put(self, episodes: IntArray, measured: Jumps) -> None:
         """Fill in some episodes."""
@@ -127,16 +138,15 @@ class Jumps:
 
 def jumps_of(block: Block, regression: Regression, scale: JumpScale) -> Jumps:
     """Look for the frames of each episode that are most likely lost, or there twice."""
-    joints = np.flatnonzero(scale.usual > 0)
-    if len(block.inside) < 2 * SIDE + 1 or not joints.size:
+    if len(block.inside) < 2 * SIDE + 1 or not scale.usual.any():
         return Jumps.empty(block.episodes.size)
-    weight = np.zeros_like(scale.usual)
-    weight[joints] = 1 / scale.usual[joints] ** 2
     jumps = _jumps(block, regression, residual=scale.residual)
     rates = windowed(block.states, RATE)
-    # The information is limited by the share of a rate that its window doesn't know.
-    along = np.einsum("tkm,tkm,m->tk", jumps, rates, weight * scale.seen)
-    power = np.einsum("tkm,tkm,m->tk", rates, rates, weight * scale.seen**2)
+    known = scale.usual > 0
+    errors = np.where(known, scale.usual**2, np.inf) + (scale.relative * rates) ** 2
+    informing = rates * (scale.seen / errors)
+    along = dot_joints(jumps, informing)
+    power = dot_joints(rates * scale.seen, informing)
     root = np.sqrt(power) + TINY
     inside = _inside(block)
     lost = np.where(inside, (along - power / 2) / root, -np.inf)
@@ -144,12 +154,40 @@ def jumps_of(block: Block, regression: Regression, scale: JumpScale) -> Jumps:
     k, columns = lost.argmax(axis=0), np.arange(block.episodes.size)
     raw = windowed(block.states, JUMP)[k, columns] if scale.residual else jumps[k, columns]
     there = rates[k, columns]
-    information = (there**2) @ weight + TINY
+    weight = 1 / errors[k, columns]
+    information = np.sum(there**2 * weight, axis=1) + TINY
+    shares = raw / np.where(there == 0, TINY, there)
     again = twice.argmax(axis=0)
+    misfit = _misfit(jumps[k, columns], there * scale.seen, weight)
     return Jumps(
-        lost[k, columns], k + SIDE, (raw * there) @ weight / information,
-        1 / np.sqrt(information), twice[again, columns], again + SIDE,
+        lost[k, columns] / misfit, k + SIDE, np.sum(raw * there * weight, axis=1) / information,
+        1 / np.sqrt(information), weighted_median(shares, there**2 * weight), twice[again, columns], again + SIDE,
     )  # fmt: skip
+
+
+def _misfit(jumps: FloatArray, rates: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return by how much the joints' times scatter more than their errors, at least 1, shape (k,).
+
+    The root of chi-squared over its degrees of freedom (Birge, Phys. Rev. 40, 1932). Half of what a
+    joint goes by is no misfit: its rate isn't constant over several frames.
+
+    Args:
+        jumps: Shape (k, m).
+        rates: What a lost frame makes of them, shape (k, m).
+        weight: Inverse variances, shape (k, m).
+    """
+    power = np.sum(rates**2 * weight, axis=1) + TINY
+    time = np.sum(jumps * rates * weight, axis=1) / power
+    expected = time[:, None] * rates
+    errors = 1 / np.maximum(weight, TINY) + (HALF * expected) ** 2
+    left = np.sum((jumps - expected) ** 2 / errors, axis=1)
+    freedom = np.maximum(np.count_nonzero(weight, axis=1) - 1, 1)
+    return np.maximum(np.sqrt(left / freedom), 1.0)
+
+
+def dot_joints(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the sum of products over the joints, shape (t, k)."""
+    return np.einsum("tkm,tkm->tk", left, right)
 
 
 def _jumps(block: Block, regression: Regression, *, residual: bool) -> FloatArray:

@@ -15,6 +15,7 @@ from .jumps import Jumps, jumps_of, scale_of
 from .record import Record, block_of, blocks_of
 from .response import fit_response, sample_of
 from .result import EpisodeFault, EpisodesResult
+from .stamps import stamped
 from .standing import standing_of
 
 SAMPLE = 12
@@ -37,11 +38,11 @@ def measure_episodes(
         name: Of the data set.
         advance: Called with the number of episodes that are done.
     """
-    stamped, not_judged = _stamps(record), dict[int, str]()
+    not_judged = dict[int, str]()
     finite = _finite(record)
     missing = [
         EpisodeFault(
-            int(record.numbers[e]), "missing", None, 1.0, "", None, np.inf, None,
+            int(record.numbers[e]), "missing", None, 1.0, "", None, None, None,
             "commands or states that are no numbers",
         )
         for e in np.flatnonzero(~finite & (record.lengths > 0)).tolist()
@@ -57,9 +58,10 @@ def measure_episodes(
         limits.append(f"{used.size} episodes are too few to compare: {ENOUGH_LIKE} at least")
     else:
         measured = _measured(record, used, advance)
-        faults = faults_of(measured, unit, margin)
+        faults, undecided = faults_of(measured, unit, margin)
+        limits += undecided
         lag_s = tuple((measured.response.lag / record.fps).tolist())
-    faults = [*missing, *stamped, *faults]
+    faults = [*missing, *stamped(record), *faults]
     return EpisodesResult(
         name=name,
         fps=record.fps,
@@ -94,7 +96,7 @@ def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) ->
         done += at.size
         advance(done)
     inflation = inflation_of(first, record.fps)
-    return Measured(record, used, response, deviations, inflation, jumps, frozen, unasked)
+    return Measured(record, used, response, sample, deviations, inflation, jumps, frozen, unasked)
 
 
 def _motion(record: Record, used: IntArray) -> FloatArray:
@@ -112,8 +114,3 @@ def _finite(record: Record) -> BoolArray:
     starts = record.starts[:-1]
     bad = ~(np.isfinite(record.commands).all(axis=1) & np.isfinite(record.states).all(axis=1))
     return np.asarray(np.add.reduceat(bad, starts) == 0, dtype=np.bool_) & (record.lengths > 0)
-
-
-def _stamps(record: Record) -> list[EpisodeFault]:
-    """Return the episodes whose frame numbers or stamps leave frames out, or repeat them."""
-    return []

@@ -102,6 +102,8 @@ def _factors(before: FloatArray, tail: float, *, largest: bool) -> FloatArray:
 
 def median_of(values: FloatArray) -> FloatArray:
     """Return the median of each column, 0 where nothing is known, shape (q,)."""
+    if np.isfinite(values).all():
+        return np.median(values, axis=0)
     known = np.isfinite(values).any(axis=0)
     return np.nan_to_num(np.nanmedian(np.where(known, values, 0.0), axis=0))
 
@@ -120,3 +122,14 @@ def scatter_of(deviations: FloatArray, errors: FloatArray) -> FloatArray:
         more = ROBUST * median_of(size / (np.hypot(middle, errors) + TINY)) > 1
         low, high = np.where(more, middle, low), np.where(more, high, middle)
     return low
+
+
+def weighted_median(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the weighted median of each row; NaN where no weight is, shape (e,)."""
+    order = np.argsort(values, axis=1)
+    ranked = np.take_along_axis(values, order, axis=1)
+    sums = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+    total = sums[:, -1:]
+    at = (sums >= total / 2).argmax(axis=1)
+    middle = np.take_along_axis(ranked, at[:, None], axis=1)[:, 0]
+    return np.where(total[:, 0] > 0, middle, np.nan)

@@ -1,9 +1,9 @@
 """Whether all joints of an episode are later, or the episode was recorded at another rate.
 
-Seen at the stated rate, an episode that was recorded at rho times it has all delays and all time
+Seen at the stated rate, an episode that was recorded at rho times it has all lags and all time
 constants rho times as long. Another delay, as of a loop that is a frame late, is the same for all
-joints, and the time constants stay. What each leaves of the states decides; where all joints have
-one lag and the motion is slow, it can't.
+joints, and the time constants stay. So the time constants decide, as far as they scatter less
+between sound episodes than the two differ by.
 """
 
 from __future__ import annotations
@@ -13,16 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.judgement.levels import TINY
+from undulog.capture.judgement.levels import FEWEST, ROBUST, TINY
 
+from ...estimators.intervals import t_factor
+from .deviations import regress
 from .record import Block
-from .response import Response, centred, dot, followed
-
-TRIED = np.linspace(0.6, 1.5, 10)
-"""Parts of the first estimate that are tried: it comes from a straight line."""
-
-DECIDED = 2 * float(np.log(100.0))
-"""Of two models, one is taken to be right if it explains the data a hundred times better."""
+from .response import Response, centred, dot, lowpass
 
 WHOLE_FRAME = 1.0
 """Where neither is decided, what is a frame or more is a delay: loops are late by whole frames."""
@@ -33,50 +29,50 @@ class Pace:
     """What explains the lags of an episode.
 
     Attributes:
-        rate: The factor of the rate; 1 if it is a delay.
-        delay: Of all joints [frames]; 0 if it is the rate.
+        is_rate: Whether it is the rate.
         decided: Whether the other one explains much less.
     """
 
-    rate: float
-    delay: float
+    is_rate: bool
     decided: bool
 
 
 def pace_of(
-    block: Block, response: Response, rate: float, delay: float, inflation: FloatArray
+    block: Block, sample: Block, response: Response, slower: float, later: float
 ) -> Pace:
     """Decide for one episode.
 
     Args:
         block: With the episode alone.
-        rate: Factor of the rate, first estimate.
-        delay: [frames], first estimate.
-        inflation: What correlation makes of the variance of each joint's lag, shape (m,).
+        sample: Sound episodes, most of them.
+        slower: Factor of the lags less 1.
+        later: Median of the joints' delays [frames].
     """
-    rates = np.maximum(1 + (rate - 1) * TRIED, 0.1)
-    delays = delay * TRIED
-    paced = [
-        Response(response.delay * k, response.constant * k, response.play) for k in rates.tolist()
-    ]
-    moved = [
-        Response(response.delay + d, response.constant, response.play) for d in delays.tolist()
-    ]
-    sizes_paced, sizes_moved = (
-        np.array([_left(block, model, inflation) for model in models]) for models in (paced, moved)
-    )
-    better = float(sizes_moved.min() - sizes_paced.min())
-    decided = abs(better) > DECIDED
-    by_rate = better > 0 if decided else abs(delay) < WHOLE_FRAME
-    if by_rate:
-        return Pace(float(rates[sizes_paced.argmin()]), 0.0, decided)
-    return Pace(1.0, float(delays[sizes_moved.argmin()]), decided)
+    moved = Response(response.delay + later, response.constant, response.play)
+    longer = float(constants_of(block, moved)[0])
+    sound = constants_of(sample, response)
+    usual = float(np.median(sound))
+    scatter = ROBUST * float(np.median(np.abs(sound - usual))) + TINY
+    limit = t_factor(max(sound.size - 1, 1)) * scatter * float(np.sqrt(1 + 1 / sound.size))
+    to_delay, to_rate = abs(longer - usual), abs(longer - usual - slower)
+    decided = sound.size >= FEWEST and max(to_delay, to_rate) > limit > min(to_delay, to_rate)
+    return Pace(to_rate < to_delay if decided else abs(later) < WHOLE_FRAME, decided)
 
 
-def _left(block: Block, response: Response, inflation: FloatArray) -> float:
-    """Return -2 log likelihood of an episode's states, with the best gain and offset."""
-    weights = block.inside.astype(np.float64)
-    weights[: min(response.settled, len(weights) // 4)] = 0.0
-    x, y = centred(followed(block, response), weights), centred(block.states, weights)
-    left = np.maximum(dot(y, y) - dot(x, y) ** 2 / np.maximum(dot(x, x), TINY), TINY)
-    return float(np.sum(np.log(left / weights.sum()) * weights.sum() / inflation))
+def constants_of(block: Block, response: Response) -> FloatArray:
+    """Return by what part the time constants of each episode are longer, over its joints, (k,).
+
+    A step of Gauss and Newton in the time constants, with gains, offsets and delays free.
+    """
+    regression = regress(block, response)
+    x, late = regression.columns
+    slow = centred(lowpass(late, response.constant), regression.weights)
+    xx, dd, dx = dot(x, x), dot(late, late), dot(late, x)
+    determinant = np.maximum(xx * dd - dx**2, TINY)
+    sx, sd = dot(slow, x), dot(slow, late)
+    by_x, by_d = (sx * dd - sd * dx) / determinant, (sd * xx - sx * dx) / determinant
+    free = slow - by_x * x - by_d * late
+    unit = response.constant * regression.deviations.gain * free
+    noise = np.maximum(regression.deviations.left, TINY)
+    power = np.sum(dot(unit, unit) / noise, axis=1)
+    return np.sum(dot(unit, regression.residual) / noise, axis=1) / np.maximum(power, TINY)

@@ -21,7 +21,8 @@ class EpisodeFault:
             it should have followed.
         unit: Of the size; empty for a factor or a number.
         ci95: Interval of the size; None where there is none.
-        times: How often the deviation is what sound episodes may have; the table is in its order.
+        times: How often the deviation is what sound episodes may have, in whose order the table is;
+            None, and first, where the record shows the fault without a comparison.
         at_s: Where in the episode [s]; None for all of it.
         sentence: The same in words.
         not_decided: Another kind that explains as much; empty if none does.
@@ -33,7 +34,7 @@ class EpisodeFault:
     size: float
     unit: str
     ci95: tuple[float, float] | None
-    times: float
+    times: float | None
     at_s: float | None
     sentence: str
     not_decided: str = ""

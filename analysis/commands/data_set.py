@@ -1,0 +1,87 @@
+"""What ``analyse`` does with a data set for learning: a table of its episodes."""
+
+from __future__ import annotations
+
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from undulog.capture.common.console import Column, echo, emit_json, output_width, progress, table
+from undulog.capture.common.files import write_text
+
+if TYPE_CHECKING:
+    from ..parts.episodes.result import EpisodesResult
+
+READING = 0.5
+"""Part of the progress that reading is."""
+
+
+def is_data_set(path: Path) -> bool:
+    """Return whether a path is the folder of a LeRobot data set."""
+    from undulog.capture.exchange.lerobot_import import is_lerobot
+
+    return path.is_dir() and is_lerobot(path)
+
+
+def analyse_data_set(folder: Path) -> EpisodesResult:
+    """Read a data set and compare its episodes, with the progress on stderr.
+
+    Raises:
+        ImportFormatError: If it is damaged.
+        MissingExtraError: If pyarrow is not installed.
+    """
+    from undulog.capture.exchange.lerobot_frames import read_frames
+    from undulog.capture.exchange.lerobot_import import open_lerobot
+
+    from ..parts.episodes.measure import measure_episodes
+    from ..parts.episodes.record import Record
+
+    dataset = open_lerobot(folder)
+    files = max(len(dataset.files()), 1)
+    with progress("analyse", total=1.0) as bar:
+        frames = read_frames(dataset, lambda done, name: bar.update(READING * done / files, name))
+        record = Record(
+            frames.names, dataset.fps, frames.numbers, frames.starts, frames.commands,
+            frames.states, frames.frame, frames.stamps_s,
+        )  # fmt: skip
+        count = max(frames.numbers.size, 1)
+        return measure_episodes(
+            record,
+            folder.resolve().name,
+            lambda done: bar.update(READING + (1 - READING) * done / count, f"{done} episodes"),
+        )
+
+
+def show_data_set(
+    folder: Path, output: Path | None, csv: Path | None, *, as_json: bool
+) -> int:
+    """Print the table of a data set, and write it to files; these may be replaced."""
+    result = analyse_data_set(folder)
+    facts = result.to_dict()
+    if output is not None:
+        write_text(output, dumps(facts, indent=2, allow_nan=False) + "\n")
+    if csv is not None:
+        from pandas import DataFrame
+
+        from ..parts.episodes.show import table_of
+        from ..present.data_frames import write_frame
+
+        write_frame(DataFrame(table_of(result)), csv)
+    if as_json:
+        emit_json(facts)
+        return 0
+    print_table(result)
+    return 0
+
+
+def print_table(result: EpisodesResult) -> None:
+    """Print the worst episodes, what is to be left out, and what can't be seen."""
+    from ..parts.episodes.show import COLUMNS, closing, heading, rows_of
+
+    echo(heading(result))
+    rows = [[(cell, "") for cell in row] for row in rows_of(result)]
+    if rows:
+        columns = [Column(title, left=title != "times the limit") for title in COLUMNS]
+        lines, _ = table(columns, rows, output_width(), cropped=True)
+        echo(*(line.plain for line in lines))
+    echo(*closing(result))
