@@ -17,9 +17,9 @@ from undulog.capture.commands.sessions import show as show_table
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import Progress, echo, emit_json, output_width, progress
 from undulog.capture.common.errors import UndulogError, UsageError
-from undulog.capture.common.files import check_output, write_text
+from undulog.capture.common.files import write_text
 
-from .data_set import is_data_set, show_data_set
+from .data_set import check_result_file, is_data_set, show_data_set
 
 if TYPE_CHECKING:
     from undulog.capture import SessionView
@@ -83,16 +83,11 @@ def analyse(
     options = chosen(start, stop, topics, reference_topic, excitation_topic)
     if any(is_data_set(file) for file in files):
         _check_data_set(files, options, [null, robot, each or None])
+        return show_data_set(files[0], output, csv, force=force, as_json=json)
     paths = sessions_of(files)
     if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
-    if output is not None:
-        why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
-        check_output(output, (".json",), why, force=force)
-    if is_data_set(files[0]):
-        if csv is not None:
-            check_output(csv, (".csv",), "the table of episodes is a CSV file", force=force)
-        return show_data_set(files[0], output, csv, as_json=json)
+    check_result_file(output, force=force)
     one_by_one = len(paths) > 1 and (each or not are_as_given(paths, files))
     if csv is not None:
         from ..present.data_frames import check_csv

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from undulog.capture.common.console import Column, echo, emit_json, output_width, progress, table
-from undulog.capture.common.files import write_text
+from undulog.capture.common.files import check_output, write_text
 
 if TYPE_CHECKING:
     from ..parts.episodes.result import EpisodesResult
@@ -52,10 +52,25 @@ def analyse_data_set(folder: Path) -> EpisodesResult:
         )
 
 
+def check_result_file(output: Path | None, *, force: bool) -> None:
+    """Check the path of a result before any work is done.
+
+    Raises:
+        OutputExistsError: If it is there and ``force`` is not given.
+        UsageError: If its name doesn't end in .json.
+    """
+    if output is not None:
+        why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
+        check_output(output, (".json",), why, force=force)
+
+
 def show_data_set(
-    folder: Path, output: Path | None, csv: Path | None, *, as_json: bool
+    folder: Path, output: Path | None, csv: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    """Print the table of a data set, and write it to files; these may be replaced."""
+    """Print the table of a data set, and write it to files."""
+    check_result_file(output, force=force)
+    if csv is not None:
+        check_output(csv, (".csv",), "the table of episodes is one CSV file", force=force)
     result = analyse_data_set(folder)
     facts = result.to_dict()
     if output is not None:

@@ -4,9 +4,12 @@ An episode is a table of commands and states, one row a tick of the control loop
 apart but for an episode whose rate is off: there they aren't, and the table doesn't show it.
 """
 
+import json
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 FINE = 8
 """Steps of the simulation in a tick."""
@@ -171,8 +174,10 @@ def simulate(rng, robot, count, fault=None):
         periods_s[fault.episode] *= 1 + fault.size
     make = taught if robot.motion == "pick" else lambda r, b, _, p: undulating(r, b, p)
     ways = make(rng, robot, count, periods_s)
-    ticks = [int(length_s / period_s) for (_, length_s), period_s in zip(ways, periods_s)]
-    actions = [way(np.arange(n) * p) for (way, _), n, p in zip(ways, ticks, periods_s)]
+    ticks = [
+        int(length_s / period_s) for (_, length_s), period_s in zip(ways, periods_s, strict=True)
+    ]
+    actions = [way(np.arange(n) * p) for (way, _), n, p in zip(ways, ticks, periods_s, strict=True)]
     held = max(robot.hold, 1)
     actions = [action[np.arange(len(action)) // held * held] for action in actions]
     if fault is not None:
@@ -245,7 +250,7 @@ def _driven(rng, robot, actions, periods_s, fault):
     states = gain[:, None] * states + offset[:, None] + robot.sag_rad * np.cos(states)
     states += robot.noise_rad * rng.standard_normal(states.shape)
     states = np.rint(states / robot.step_rad) * robot.step_rad
-    return [state[: len(action)] for state, action in zip(states, actions)]
+    return [state[: len(action)] for state, action in zip(states, actions, strict=True)]
 
 
 def _recorded_wrong(rng, robot, actions, states, fault):
@@ -269,3 +274,49 @@ def _recorded_wrong(rng, robot, actions, states, fault):
             actions[e] = actions[e][: len(states[e])]
         else:
             actions[e] = np.delete(actions[e], gone, axis=0)
+
+
+def write(folder, data, version="v3.0"):
+    """Write a data set as LeRobot lays it out: v2 an episode a file, v3 all of them in one."""
+    joints = [f"joint_{k}.pos" for k in range(data.robot.joints)]
+    feature = {"dtype": "float32", "shape": [len(joints)], "names": joints}
+    number = {"dtype": "int64", "shape": [1], "names": None}
+    names = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+    info = {
+        "codebase_version": version,
+        "robot_type": data.robot.motion,
+        "fps": data.robot.fps,
+        "features": {"action": feature, "observation.state": feature}
+        | dict.fromkeys(names, number),
+    }
+    chunk = folder / "data" / "chunk-000"
+    for path in (chunk, folder / "meta"):
+        path.mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    tables = [_table(data, e) for e in range(len(data.actions))]
+    if version == "v3.0":
+        pq.write_table(pa.concat_tables(tables), chunk / "file-000.parquet")
+    else:
+        for e, table in enumerate(tables):
+            pq.write_table(table, chunk / f"episode_{e:06d}.parquet")
+    return folder
+
+
+def _table(data, episode):
+    action, state = data.actions[episode], data.states[episode]
+    frames = np.arange(len(action))
+    vectors = {
+        name: pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        for name, values in (("action", action), ("observation.state", state))
+    }
+    first = sum(map(len, data.actions[:episode]))
+    return pa.table(
+        {
+            **vectors,
+            "timestamp": pa.array((frames / data.robot.fps).astype(np.float32)),
+            "frame_index": frames,
+            "episode_index": np.full(frames.size, episode),
+            "index": first + frames,
+            "task_index": np.zeros(frames.size, dtype=np.int64),
+        }
+    )

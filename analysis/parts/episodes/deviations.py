@@ -12,10 +12,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import TINY
 
-from .record import Block, Record, block_of
+from .record import Block
 from .response import Response, centred, dot, followed, rate_of
 
 BLOCK_S = 0.5
@@ -54,6 +54,14 @@ class Deviations:
     def empty(cls, episodes: int, joints: int) -> Deviations:
         """Return deviations of which none is measured."""
         return cls(*(np.full((episodes, joints), np.nan) for _ in fields(cls)))
+
+    def with_better(self, other: Deviations, better: BoolArray) -> Deviations:
+        """Return these, with others where those are better, shape (e, m)."""
+        arrays: list[FloatArray] = [
+            np.where(better, getattr(other, field.name), getattr(self, field.name))
+            for field in fields(self)
+        ]
+        return Deviations(*arrays)
 
     def put(self, episodes: IntArray, measured: Deviations) -> None:
         """Fill in some episodes."""
@@ -110,28 +118,24 @@ def regress(block: Block, response: Response) -> Regression:
 
 def inflation_of(regression: Regression, fps: float) -> FloatArray:
     """Return what correlation makes of the variances of level, gain and lag, shape (3, m)."""
-    frames = max(int(round(BLOCK_S * fps)), 1)
+    frames = max(round(BLOCK_S * fps), 1)
     residual = regression.residual
     starts = np.arange(0, len(residual), frames)
     ratios: list[FloatArray] = []
     for scores in (residual, *(residual * column for column in regression.columns)):
         sums = np.add.reduceat(scores, starts, axis=0)
-        ratios.append(dot(sums, sums).sum(axis=0) / np.maximum(dot(scores, scores).sum(axis=0), TINY))
+        ratios.append(
+            dot(sums, sums).sum(axis=0) / np.maximum(dot(scores, scores).sum(axis=0), TINY)
+        )
     return np.maximum(np.stack(ratios), 1.0)
 
 
-def refined(
-    record: Record, response: Response, deviations: Deviations, indices: IntArray,
-    episodes: IntArray, most: int,
-) -> None:  # fmt: skip
-    """Search the lags of some episodes frame by frame, and put what fits best in place.
+def searched(block: Block, response: Response, most: int) -> Deviations:
+    """Search the lags of a block's episodes frame by frame, and return what fits best.
 
     Args:
-        indices: Of the episodes in the deviations, shape (k,).
-        episodes: Of the same in the record, shape (k,).
         most: Frames on either side of the common delay.
     """
-    block = block_of(record, episodes)
     best = regress(block, response).deviations
     for shift in range(-most, most + 1):
         moved = Response(response.delay + shift, response.constant, response.play)
@@ -139,10 +143,5 @@ def refined(
         tried = replace(tried, lag=tried.lag + shift)
         forward = tried.gain > 0
         better = forward & ((tried.left < best.left) | (best.gain <= 0))
-        best = Deviations(
-            *(
-                np.where(better, getattr(tried, field.name), getattr(best, field.name))
-                for field in fields(Deviations)
-            )
-        )
-    deviations.put(indices, best)
+        best = best.with_better(tried, better)
+    return best

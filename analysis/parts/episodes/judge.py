@@ -17,9 +17,19 @@ from scipy.special import ndtri
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import some_names
-from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD, ENOUGH_LIKE, FULL, HALF, QUARTER, REST_ERRORS, TINY, WIDTH
+from undulog.capture.judgement.levels import (
+    ANGLE_MARGIN_RAD,
+    ENOUGH_LIKE,
+    FULL,
+    HALF,
+    QUARTER,
+    RARE,
+    REST_ERRORS,
+    TINY,
+    WIDTH,
+)
 
-from .deviations import Deviations, refined
+from .deviations import Deviations, searched
 from .jumps import Jumps
 from .outliers import Outliers, median_of, outliers_of, scatter_of, weighted_median
 from .pace import pace_of
@@ -92,9 +102,7 @@ class Measured:
     unasked: FloatArray
 
 
-def faults_of(
-    measured: Measured, unit: str, margin: float
-) -> tuple[list[EpisodeFault], list[str]]:
+def faults_of(measured: Measured, unit: str, margin: float) -> tuple[list[EpisodeFault], list[str]]:
     """Return what is wrong, worst first, and what isn't decided.
 
     Args:
@@ -106,12 +114,9 @@ def faults_of(
     faults = [*judge.jumps(), *judge.standing()]
     skipped = {fault.episode for fault in faults if fault.joint is None}
     named = {(fault.episode, fault.joint) for fault in faults}
-    for fault in judge.shared(skipped):
-        faults.append(fault)
+    faults += judge.shared(skipped)
     faults += [
-        fault
-        for fault in judge.joints(skipped)
-        if (fault.episode, fault.joint) not in named
+        fault for fault in judge.joints(skipped) if (fault.episode, fault.joint) not in named
     ]
     ranked = sorted(faults, key=lambda fault: (-(fault.times or 0.0), fault.episode))
     return ranked, [*judge.limits, *judge.unknown()]
@@ -130,7 +135,7 @@ def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, Floa
     noise = np.sqrt(left * measured.inflation)  # level, gain, lag
     farthest = SEARCHED_S * measured.record.fps
     asked = usual**2 * d.asked >= REST_ERRORS**2 * left
-    follows = asked & (d.left <= HALF * d.power)
+    follows = asked & (d.left <= HALF * d.power) & (d.power > RARE * usual**2 * d.asked)
     values = {
         "gain": np.where(follows, d.gain / usual - 1, np.nan),
         "lag": np.where(follows & (np.abs(d.lag) < farthest), d.lag, np.nan),
@@ -156,10 +161,8 @@ def _search_again(measured: Measured) -> None:
         most = max(int(np.ceil(SEARCHED_S * measured.record.fps)), 1)
         for first in range(0, again.size, TOGETHER):
             indices = again[first : first + TOGETHER]
-            refined(
-                measured.record, measured.response, measured.deviations,
-                indices, measured.used[indices], most,
-            )  # fmt: skip
+            block = block_of(measured.record, measured.used[indices])
+            measured.deviations.put(indices, searched(block, measured.response, most))
 
 
 class _Judge:
@@ -215,7 +218,7 @@ class _Judge:
         count = max(round(time), 1)
         return EpisodeFault(
             number, "dropped", None, float(count), "frames", (time - half, time + half), times,
-            at_s, f"all joints jump at {at_s:.2f} s as if {count} frame{'s' * (count > 1)} "
+            at_s, f"all joints jump at {at_s:.2f} s as if about {count} frame{'s' * (count > 1)} "
             "were missing",
         )  # fmt: skip
 
@@ -227,37 +230,41 @@ class _Judge:
 
     def standing(self) -> Iterator[EpisodeFault]:
         """Yield joints whose states or commands stand while the others move."""
-        for values, signal, other in (
-            (self._m.frozen, "state", "command"), (self._m.unasked, "command", "state"),
-        ):  # fmt: skip
-            outliers = self._largest(values, self._margin)
-            for index in np.flatnonzero(outliers.outside.any(axis=1)).tolist():
-                joints = np.flatnonzero(outliers.outside[index] & (outliers.deviation[index] > 0))
-                if joints.size:
-                    yield from self._stands(index, joints, values, outliers, signal, other)
+        gain = self._values["gain"] + 1
+        margin = REST_ERRORS * self._margin
+        scaled = (np.abs(gain) > SCALED) | (np.abs(gain) < QUARTER)  # it follows, otherwise
+        for signal, values in (("state", self._m.frozen), ("command", self._m.unasked)):
+            outliers = self._largest(values, margin)
+            stands = self._few(
+                outliers.outside & (outliers.deviation > 0) & ~scaled,
+                [f"a {signal} that stands, of {name}" for name in self._m.record.names],
+            )
+            times = outliers.deviation / np.maximum(outliers.half, margin)
+            for index in np.flatnonzero(stands.any(axis=1)).tolist():
+                joints = np.flatnonzero(stands[index]).tolist()
+                yield from self._stands(index, joints, signal, values[index], times[index])
 
     def _stands(
-        self, index: int, joints: IntArray, values: FloatArray, outliers: Outliers,
-        signal: str, other: str,
-    ) -> Iterator[EpisodeFault]:  # fmt: skip
+        self, index: int, joints: list[int], signal: str, sizes: FloatArray, times: FloatArray
+    ) -> Iterator[EpisodeFault]:
         number, names = self._number(index), self._m.record.names
-        times = outliers.deviation[index] / np.maximum(outliers.half[index], self._margin)
-        moving = self._m.deviations.count[index] > 0
-        if joints.size > 1 and joints.size >= HALF * np.count_nonzero(moving):
-            size = float(values[index, joints].max())
+        other = "command" if signal == "state" else "state"
+        if len(joints) > 1 and len(joints) >= HALF * len(names):
+            size, time = float(sizes[joints].max()), float(times[joints].max())
+            sentence = f"{len(joints)} of {len(names)} joints stand while their {other}s move"
             yield EpisodeFault(
-                number, "stand-still", None, size, self._unit, None,
-                float(times[joints].max()), None,
-                f"{joints.size} of {len(names)} joints stand while their {other}s move",
-            )  # fmt: skip
+                number, "stand-still", None, size, self._unit, None, time, None, sentence
+            )
             return
-        for j in joints.tolist():
-            size = float(values[index, j])
+        for j in joints:
+            size = float(sizes[j])
+            sentence = (
+                f"{names[j]}: the {signal} stands while the {other} moves by {size:.3g} "
+                f"{self._unit}"
+            )
             yield EpisodeFault(
-                number, "frozen", names[j], size, self._unit, None, float(times[j]), None,
-                f"{names[j]}: the {signal} stands while the {other} moves by "
-                f"{size:.3g} {self._unit}".rstrip(),
-            )  # fmt: skip
+                number, "frozen", names[j], size, self._unit, None, float(times[j]), None, sentence
+            )
 
     def _largest(self, values: FloatArray, margin: float) -> Outliers:
         return outliers_of(values, np.zeros_like(values), margin, self._level, largest=True)
@@ -277,9 +284,7 @@ class _Judge:
             if self._number(index) not in skipped:
                 yield self._shared(index, float(slower[index]), float(later[index]), outliers)
 
-    def _shared(
-        self, index: int, slower: float, later: float, outliers: Outliers
-    ) -> EpisodeFault:
+    def _shared(self, index: int, slower: float, later: float, outliers: Outliers) -> EpisodeFault:
         record, response = self._m.record, self._m.response
         block = block_of(record, self._m.used[[index]])
         pace = pace_of(block, self._m.sample, response, slower, later)
@@ -380,7 +385,9 @@ class _Judge:
 def unit_of(record: Record, episodes: Sequence[int]) -> tuple[str, float]:
     """Return the unit of the states as their values show it, and an offset that matters in it."""
     rows = [slice(int(record.starts[e]), int(record.starts[e + 1])) for e in episodes]
-    largest = max((float(np.max(np.abs(record.states[row]), initial=0.0)) for row in rows), default=0)
+    largest = max(
+        (float(np.max(np.abs(record.states[row]), initial=0.0)) for row in rows), default=0
+    )
     if largest > 4 * np.pi:
         return "deg", float(np.degrees(ANGLE_MARGIN_RAD))
     return "rad", ANGLE_MARGIN_RAD

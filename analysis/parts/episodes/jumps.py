@@ -3,9 +3,8 @@
 A frame that was lost moves all joints at once by what they go in a frame. The four frames on either
 side of a transition show a joint's rate, and its jump: that of a step beside a parabola by least
 squares. What the command explains is no loss, so the jump is that of the residual of
-:mod:`.response`. If the recorder lost a frame, it lost the command's, too, and what that does to the
-residual is known: a step less the step response. The time that is missing between two frames is,
-over all joints,
+:mod:`.response`. If the recorder lost a frame, it lost the command's, too, and what that makes of
+the residual is known: a step less the step response. Over all joints, the missing time is
 
     tau = sum(jump rate / e^2) / i,    i = sum(rate^2 / e^2),    e^2 = s^2 + (r rate)^2     (1)
 
@@ -23,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import HALF, TINY
 
 from .deviations import Regression
@@ -78,12 +77,14 @@ class JumpScale:
         usual: s of equation (1), shape (m,).
         relative: r of equation (1) [frames], shape (m,).
         seen: Part of a lost frame's jump, shape (m,).
+        gain: Of sound episodes, shape (m,).
         residual: Whether the residuals are looked at, or else the states.
     """
 
     usual: FloatArray
     relative: FloatArray
     seen: FloatArray
+    gain: FloatArray
     residual: bool
 
 
@@ -98,7 +99,8 @@ def scale_of(block: Block, regression: Regression, response: Response) -> JumpSc
     usual = np.median(dot(jumps, jumps) / count, axis=0)
     power = rates**2
     relative = np.median(dot(jumps**2, power) / (dot(power, power) + TINY), axis=0)
-    return JumpScale(np.sqrt(usual), np.sqrt(relative), seen, residual)
+    gain = np.abs(np.median(regression.deviations.gain, axis=0))
+    return JumpScale(np.sqrt(usual), np.sqrt(relative), seen, gain, residual)
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,9 @@ class Jumps:
     @classmethod
     def empty(cls, episodes: int) -> Jumps:
         """Return what no frame is looked at for."""
-        none = [np.full(episodes, np.nan) for _ in range(5)]
-        numbers = [np.zeros(episodes, np.int64) for _ in range(2)]
-        return cls(none[0], numbers[0], *none[1:], numbers[1])
+        lost, time, error, middle, twice = (np.full(episodes, np.nan) for _ in range(5))
+        after, twice_after = (np.zeros(episodes, np.int64) for _ in range(2))
+        return cls(lost, after, time, error, middle, twice, twice_after)
 
     def put(self, episodes: IntArray, measured: Jumps) -> None:
         """Fill in some episodes."""
@@ -143,7 +145,10 @@ def jumps_of(block: Block, regression: Regression, scale: JumpScale) -> Jumps:
     jumps = _jumps(block, regression, residual=scale.residual)
     rates = windowed(block.states, RATE)
     known = scale.usual > 0
-    errors = np.where(known, scale.usual**2, np.inf) + (scale.relative * rates) ** 2
+    # In a signal that is scaled, noise is, too.
+    scaled = np.maximum(np.abs(regression.deviations.gain) / (scale.gain + TINY), 1.0)
+    errors = np.where(known, (scale.usual * scaled) ** 2, np.inf)
+    errors = errors + (scale.relative * rates) ** 2
     informing = rates * (scale.seen / errors)
     along = dot_joints(jumps, informing)
     power = dot_joints(rates * scale.seen, informing)
@@ -160,9 +165,14 @@ def jumps_of(block: Block, regression: Regression, scale: JumpScale) -> Jumps:
     again = twice.argmax(axis=0)
     misfit = _misfit(jumps[k, columns], there * scale.seen, weight)
     return Jumps(
-        lost[k, columns] / misfit, k + SIDE, np.sum(raw * there * weight, axis=1) / information,
-        1 / np.sqrt(information), weighted_median(shares, there**2 * weight), twice[again, columns], again + SIDE,
-    )  # fmt: skip
+        lost=lost[k, columns] / misfit,
+        after=k + SIDE,
+        time=np.sum(raw * there * weight, axis=1) / information,
+        error=1 / np.sqrt(information),
+        middle=weighted_median(shares, there**2 * weight),
+        twice=twice[again, columns],
+        twice_after=again + SIDE,
+    )
 
 
 def _misfit(jumps: FloatArray, rates: FloatArray, weight: FloatArray) -> FloatArray:
@@ -199,6 +209,6 @@ def _jumps(block: Block, regression: Regression, *, residual: bool) -> FloatArra
     return windowed(values, JUMP) * _inside(block)[:, :, None]
 
 
-def _inside(block: Block) -> FloatArray:
+def _inside(block: Block) -> BoolArray:
     """Return whether all frames of a window are inside, shape (t - 2 SIDE + 1, k)."""
     return block.inside[2 * SIDE - 1 :]

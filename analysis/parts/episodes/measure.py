@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.judgement.levels import ENOUGH_LIKE, FEWEST
+from undulog.capture.judgement.levels import COVERAGE, ENOUGH_LIKE, FEWEST
 
 from .deviations import Deviations, inflation_of, regress
 from .judge import Measured, faults_of, unit_of
@@ -25,7 +27,8 @@ SHORTEST = 2 * FEWEST
 """Frames of an episode that is judged, at least, besides those in which its joints settle."""
 
 ALL_RATES = (
-    "a rate that is wrong in all episodes can't be seen: frames have no times but frame number / fps"
+    "a rate that is wrong in all episodes can't be seen: the times of frames are made from their "
+    "numbers and fps"
 )
 
 
@@ -40,13 +43,6 @@ def measure_episodes(
     """
     not_judged = dict[int, str]()
     finite = _finite(record)
-    missing = [
-        EpisodeFault(
-            int(record.numbers[e]), "missing", None, 1.0, "", None, None, None,
-            "commands or states that are no numbers",
-        )
-        for e in np.flatnonzero(~finite & (record.lengths > 0)).tolist()
-    ]  # fmt: skip
     long_enough = record.lengths > SHORTEST
     for e in np.flatnonzero(~long_enough).tolist():
         not_judged[int(record.numbers[e])] = f"{int(record.lengths[e])} frames are too few"
@@ -61,7 +57,7 @@ def measure_episodes(
         faults, undecided = faults_of(measured, unit, margin)
         limits += undecided
         lag_s = tuple((measured.response.lag / record.fps).tolist())
-    faults = [*missing, *stamped(record), *faults]
+    faults = [*_by_itself(record, finite, long_enough), *stamped(record), *faults]
     return EpisodesResult(
         name=name,
         fps=record.fps,
@@ -77,7 +73,8 @@ def measure_episodes(
 
 
 def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) -> Measured:
-    sample = block_of(record, used[sample_of(record.lengths[used], _motion(record, used), SAMPLE)])
+    motion = _moved(record, record.commands)[used].sum(axis=1)
+    sample = block_of(record, used[sample_of(record.lengths[used], motion, SAMPLE)])
     response = fit_response(sample, record.fps)
     first = regress(sample, response)
     scale = scale_of(sample, first, response)
@@ -99,14 +96,26 @@ def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) ->
     return Measured(record, used, response, sample, deviations, inflation, jumps, frozen, unasked)
 
 
-def _motion(record: Record, used: IntArray) -> FloatArray:
-    """Return how far the commands of some episodes go, in the joints' usual range, shape (u,)."""
+def _by_itself(record: Record, finite: BoolArray, long_enough: BoolArray) -> Iterator[EpisodeFault]:
+    """Yield episodes without numbers, and those in which nothing moves."""
+    whole = np.flatnonzero(finite & long_enough)
+    still = np.zeros(record.numbers.size, dtype=np.bool_)
+    if whole.size:
+        moved = np.maximum(_moved(record, record.commands), _moved(record, record.states))
+        still[whole] = np.nanmax(moved[whole], axis=1, initial=0.0) < 1 - COVERAGE
+    for e in np.flatnonzero(still | ~finite).tolist():
+        kind, sentence = "stand-still", "no joint moves"
+        if not still[e]:
+            kind, sentence = "missing", "commands or states are missing or no numbers"
+        yield EpisodeFault(int(record.numbers[e]), kind, None, 0.0, "", None, None, None, sentence)
+
+
+def _moved(record: Record, values: NDArray[np.floating[Any]]) -> FloatArray:
+    """Return the range of each joint in each episode, in parts of its usual one, shape (e, m)."""
     starts = record.starts[:-1]
-    low = np.minimum.reduceat(record.commands, starts, axis=0)
-    high = np.maximum.reduceat(record.commands, starts, axis=0)
-    ranges = (high - low).astype(np.float64)[used]
-    usual = np.median(ranges, axis=0)
-    return np.asarray((ranges / np.where(usual > 0, usual, 1.0)).sum(axis=1), dtype=np.float64)
+    ranges = np.maximum.reduceat(values, starts) - np.minimum.reduceat(values, starts)
+    usual = np.nanmedian(ranges, axis=0)
+    return np.asarray(ranges / np.where(usual > 0, usual, np.inf), dtype=np.float64)
 
 
 def _finite(record: Record) -> BoolArray:

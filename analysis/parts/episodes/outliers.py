@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import ENOUGH_LIKE, ROBUST, TINY, WHOLE
 
 ROUNDS = 12
@@ -70,11 +70,12 @@ def outliers_of(
     limits = factor * deviation * np.sqrt(1 + 1 / np.maximum(before, 1))
     eligible = (before >= np.maximum(WHOLE * count, ENOUGH_LIKE - 1)) & (before < count)
     stands = eligible[:-1] & (np.abs(ranked - mean[:-1]) > limits[:-1])
-    sound = np.where(stands.any(axis=0), stands.argmax(axis=0), count)[None, :]
+    first: IntArray = np.where(stands.any(axis=0), stands.argmax(axis=0), count)
+    sound = first[None, :]
     sound_mean, limit, sd = (
         np.take_along_axis(array, sound, axis=0) for array in (mean, limits, deviation)
     )
-    size, half = (scaled - sound_mean) * spread, limit * spread
+    size, half = values - middle - sound_mean * spread, limit * spread
     known = np.isfinite(size) & (count >= ENOUGH_LIKE)
     outside = known & (np.abs(size) > np.maximum(half, margins))
     return Outliers(size, half, np.maximum(sd, TINY) * spread, outside)

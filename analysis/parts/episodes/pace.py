@@ -23,6 +23,9 @@ from .response import Response, centred, dot, lowpass
 WHOLE_FRAME = 1.0
 """Where neither is decided, what is a frame or more is a delay: loops are late by whole frames."""
 
+CLOSER = 2.0
+"""One is decided if the time constants are so many times as close to what it makes of them."""
+
 
 @dataclass(frozen=True)
 class Pace:
@@ -37,9 +40,7 @@ class Pace:
     decided: bool
 
 
-def pace_of(
-    block: Block, sample: Block, response: Response, slower: float, later: float
-) -> Pace:
+def pace_of(block: Block, sample: Block, response: Response, slower: float, later: float) -> Pace:
     """Decide for one episode.
 
     Args:
@@ -55,7 +56,8 @@ def pace_of(
     scatter = ROBUST * float(np.median(np.abs(sound - usual))) + TINY
     limit = t_factor(max(sound.size - 1, 1)) * scatter * float(np.sqrt(1 + 1 / sound.size))
     to_delay, to_rate = abs(longer - usual), abs(longer - usual - slower)
-    decided = sound.size >= FEWEST and max(to_delay, to_rate) > limit > min(to_delay, to_rate)
+    near, far = sorted((to_delay, to_rate))
+    decided = sound.size >= FEWEST and far > max(limit, CLOSER * near)
     return Pace(to_rate < to_delay if decided else abs(later) < WHOLE_FRAME, decided)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,8 @@ class Record:
     fps: float
     numbers: IntArray
     starts: IntArray
-    commands: NDArray[np.floating]
-    states: NDArray[np.floating]
+    commands: NDArray[np.floating[Any]]
+    states: NDArray[np.floating[Any]]
     frame: IntArray
     stamps_s: FloatArray | None = None
 

@@ -203,7 +203,7 @@ class _Fitter:
         best = np.full(m, np.inf)
         delay, constant = np.zeros(m), np.zeros(m)
         for a in constants.tolist():
-            passed = lowpass(self.block.commands, np.full(m, a))
+            passed = lowpass(self.block.commands, np.full(m, a, np.float64))
             for d in range(latest + 1):
                 moved = passed[np.maximum(np.arange(len(passed)) - d, 0)]
                 squares = self.pooled(self.left(centred(moved, self.weights)))
@@ -228,11 +228,7 @@ class _Fitter:
             x_tried = centred(followed(self.block, tried), self.weights)
             squares_tried = self.pooled(self.left(x_tried), kept)
             better = squares_tried < squares
-            response = Response(
-                np.where(better, tried.delay, response.delay),
-                np.where(better, tried.constant, response.constant),
-                response.play,
-            )
+            response = chosen(better, tried, response)
             x = np.where(better, x_tried, x)
             gained = np.where(better, squares - squares_tried, 0.0)
             squares = np.where(better, squares_tried, squares)
@@ -263,24 +259,26 @@ class _Fitter:
 
     def with_play(self, response: Response, latest: int) -> Response:
         """Return the response with the backlash that leaves least, if that is less."""
-        usual = np.median(np.ptp(self.block.commands, axis=0), axis=0)
+        usual: FloatArray = np.median(np.ptp(self.block.commands, axis=0), axis=0)
         best = response
         squares = self.pooled(self.left(centred(followed(self.block, response), self.weights)))
         squares = squares * LESS
         for part in PLAYS[1:]:
-            tried = self.improved(
-                Response(response.delay, response.constant, part * usual), latest
-            )
+            tried = self.improved(Response(response.delay, response.constant, part * usual), latest)
             now = self.pooled(self.left(centred(followed(self.block, tried), self.weights)))
             better = now < squares
             squares = np.where(better, now, squares)
-            best = Response(
-                *(
-                    np.where(better, getattr(tried, name), getattr(best, name))
-                    for name in ("delay", "constant", "play")
-                )
-            )
+            best = chosen(better, tried, best)
         return best
+
+
+def chosen(better: BoolArray, tried: Response, best: Response) -> Response:
+    """Return one of two responses for each joint."""
+    return Response(
+        np.where(better, tried.delay, best.delay),
+        np.where(better, tried.constant, best.constant),
+        np.where(better, tried.play, best.play),
+    )
 
 
 def rate_of(x: FloatArray, weights: FloatArray) -> FloatArray:

@@ -30,8 +30,10 @@ def rows_of(result: EpisodesResult) -> Iterator[tuple[str, ...]]:
 
 def heading(result: EpisodesResult) -> str:
     """Return the first line: the answer."""
-    size = f"{result.episodes} episode{'s' * (result.episodes != 1)}"
-    size += f", {len(result.joints)} joints, {result.frames / result.fps:.0f} s at {result.fps:g} Hz"
+    size = (
+        f"{result.episodes} episode{'s' * (result.episodes != 1)} of {len(result.joints)} joints, "
+        f"{result.frames / result.fps:.0f} s at {result.fps:g} Hz, angles in {result.unit}"
+    )
     bad = len(result.leave_out)
     if not bad:
         return f"{result.name}: {size}; no episode stands out"

@@ -30,7 +30,7 @@ def standing_of(
     Returns:
         By states that stand and by commands that stand, shape (k, m) each, in the states' unit.
     """
-    half = max(int(round(WINDOW_S * fps / 2)), 1)
+    half = max(round(WINDOW_S * fps / 2), 1)
     asked = _ranges(regression.x, block, half) * np.abs(gain)
     moved = _ranges(block.states, block, half)
     frozen = np.where(moved < QUARTER * asked, asked, 0.0).max(axis=0, initial=0.0)
