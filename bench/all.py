@@ -54,6 +54,7 @@ BENCHES = {
     "limits": Bench("limits", "", "--runs 1 joints channels"),
     "bag-import": Bench("bag_import", "", "--messages 8000"),
     "table-import": Bench("table_import", "", "--runs 3"),
+    "data-set": Bench("data_set", "", "--episodes 500 --runs 2"),
     "durable": Bench("durable", "", "--messages 10000"),
     "sources": Bench("sources", "", "--frames 4000"),
     "serial": Bench("serial_listen", "", "--frames 4000"),

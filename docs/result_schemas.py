@@ -14,6 +14,7 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
+from undulog.analysis.parts.episodes.result import EpisodesResult
 from undulog.analysis.results import analysis, answer, oscillators
 from undulog.analysis.results.analysis import Analysis, interval_key
 from undulog.analysis.results.body import BodyPoint, BodyTravel, LinkContact, Serpenoid, ShapeMode
@@ -34,6 +35,7 @@ RESULTS: dict[str, tuple[type, str]] = {
     "analysis": (Analysis, "undulog analyse FILE --json"),
     "experiment": (Experiment, "undulog analyse FILE FILE ... --json"),
     "comparison": (Comparison, "undulog compare A B --json"),
+    "episodes": (EpisodesResult, "undulog analyse DATASET --json"),
     "prediction": (oscillators.ClosedLoop, "undulog predict FILE --eps EPS --json"),
 }
 """Name of each result to its dataclass and the command that prints it."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import emit
+from ..common.console import echo, emit
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file, why_no_file
 from .topic_options import CONTRACT, JointTopicOptions
@@ -129,7 +129,10 @@ def import_log(
                 write_map=write_map, force=force, stop=stop,
             )  # fmt: skip
             reports = [report]
-    return _report_imports(reports, json=json)
+    code = _report_imports(reports, json=json)
+    if dataset and len(reports) > 1 and not json:
+        echo(f"what is wrong with which episode: undulog analyse {log}")
+    return code
 
 
 def _report_imports(reports: Sequence[ImportReport], *, json: bool) -> int:

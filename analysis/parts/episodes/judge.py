@@ -111,7 +111,9 @@ def faults_of(measured: Measured, unit: str, margin: float) -> tuple[list[Episod
     """
     _search_again(measured)
     judge = _Judge(measured, unit, margin)
-    faults = [*judge.jumps(), *judge.standing()]
+    faults = [*judge.jumps()]
+    lost = {fault.episode for fault in faults}
+    faults += [fault for fault in judge.standing() if fault.episode not in lost]
     skipped = {fault.episode for fault in faults if fault.joint is None}
     named = {(fault.episode, fault.joint) for fault in faults}
     faults += judge.shared(skipped)
@@ -184,6 +186,9 @@ class _Judge:
             for k in np.flatnonzero(many).tolist()
         ]
         return outside & ~many
+
+    def _degrees(self, angle: float) -> float:
+        return float(np.degrees(angle)) if self._unit == "rad" else angle
 
     def _number(self, index: int) -> int:
         return int(self._m.record.numbers[self._m.used[index]])
@@ -259,8 +264,8 @@ class _Judge:
         for j in joints:
             size = float(sizes[j])
             sentence = (
-                f"{names[j]}: the {signal} stands while the {other} moves by {size:.3g} "
-                f"{self._unit}"
+                f"{names[j]}: the {signal} stands while the {other} moves by "
+                f"{self._degrees(size):.1f} degrees"
             )
             yield EpisodeFault(
                 number, "frozen", names[j], size, self._unit, None, float(times[j]), None, sentence
@@ -364,7 +369,7 @@ class _Judge:
         width = WIDTH * float(outliers.error[index, j])
         name, fps = self._m.record.names[j], self._m.record.fps
         if quantity == "offset":
-            kind, unit, text = "offset", self._unit, f"rests {size:+.3g} {self._unit} off"
+            kind, unit, text = "offset", self._unit, f"rests {self._degrees(size):+.1f} degrees off"
         elif quantity == "lag":
             kind, unit, size, width = "delay", "s", size / fps, width / fps
             text = f"follows {abs(size) * 1e3:.0f} ms {'later' if size > 0 else 'earlier'}"

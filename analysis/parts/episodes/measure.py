@@ -41,11 +41,11 @@ def measure_episodes(
         name: Of the data set.
         advance: Called with the number of episodes that are done.
     """
-    not_judged = dict[int, str]()
+    not_judged = dict[str, str]()
     finite = _finite(record)
     long_enough = record.lengths > SHORTEST
     for e in np.flatnonzero(~long_enough).tolist():
-        not_judged[int(record.numbers[e])] = f"{int(record.lengths[e])} frames are too few"
+        not_judged[str(record.numbers[e])] = f"{int(record.lengths[e])} frames are too few"
     used: IntArray = np.flatnonzero(finite & long_enough)
     limits = [ALL_RATES]
     faults, lag_s = list[EpisodeFault](), tuple[float, ...]()
@@ -68,6 +68,7 @@ def measure_episodes(
         lag_s=lag_s,
         faults=tuple(faults),
         not_judged=not_judged,
+        leave_out=tuple(sorted({fault.episode for fault in faults})),
         limits=tuple(limits),
     )
 

@@ -70,8 +70,8 @@ def outliers_of(
     limits = factor * deviation * np.sqrt(1 + 1 / np.maximum(before, 1))
     eligible = (before >= np.maximum(WHOLE * count, ENOUGH_LIKE - 1)) & (before < count)
     stands = eligible[:-1] & (np.abs(ranked - mean[:-1]) > limits[:-1])
-    first: IntArray = np.where(stands.any(axis=0), stands.argmax(axis=0), count)
-    sound = first[None, :]
+    sound: IntArray = np.argmax(stands, axis=0, keepdims=True).astype(np.int64)
+    sound[~stands.any(axis=0, keepdims=True)] = count[~stands.any(axis=0)]
     sound_mean, limit, sd = (
         np.take_along_axis(array, sound, axis=0) for array in (mean, limits, deviation)
     )

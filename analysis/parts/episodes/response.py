@@ -199,11 +199,11 @@ class _Fitter:
 
     def searched(self, constants: FloatArray, latest: int) -> Response:
         """Return the best of a grid of whole delays and some constants."""
-        m = self.y.shape[2]
+        m = int(self.y.shape[2])
         best = np.full(m, np.inf)
         delay, constant = np.zeros(m), np.zeros(m)
         for a in constants.tolist():
-            passed = lowpass(self.block.commands, np.full(m, a, np.float64))
+            passed = lowpass(self.block.commands, np.full((m,), a))
             for d in range(latest + 1):
                 moved = passed[np.maximum(np.arange(len(passed)) - d, 0)]
                 squares = self.pooled(self.left(centred(moved, self.weights)))
@@ -259,7 +259,8 @@ class _Fitter:
 
     def with_play(self, response: Response, latest: int) -> Response:
         """Return the response with the backlash that leaves least, if that is less."""
-        usual: FloatArray = np.median(np.ptp(self.block.commands, axis=0), axis=0)
+        commands = self.block.commands
+        usual = np.asarray(np.median(commands.max(axis=0) - commands.min(axis=0), axis=0), float)
         best = response
         squares = self.pooled(self.left(centred(followed(self.block, response), self.weights)))
         squares = squares * LESS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -54,6 +53,7 @@ class EpisodesResult:
         lag_s: Lag that all episodes share, by joint [s].
         faults: Worst first.
         not_judged: Why not, by the number of the episode.
+        leave_out: Numbers of the episodes that have a fault, in order.
         limits: What can't be seen in this data set, in sentences.
     """
 
@@ -65,16 +65,10 @@ class EpisodesResult:
     joints: tuple[str, ...]
     lag_s: tuple[float, ...]
     faults: tuple[EpisodeFault, ...]
-    not_judged: Mapping[int, str]
+    not_judged: dict[str, str]
+    leave_out: tuple[int, ...]
     limits: tuple[str, ...]
-
-    @property
-    def leave_out(self) -> list[int]:
-        """Numbers of the episodes that have a fault, in order."""
-        return sorted({fault.episode for fault in self.faults})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON has it."""
-        facts = asdict(self)
-        facts["not_judged"] = {str(number): why for number, why in self.not_judged.items()}
-        return {**facts, "leave_out": self.leave_out}
+        return asdict(self)

@@ -12,9 +12,6 @@ from .result import EpisodeFault, EpisodesResult
 MOST_LINES = 10
 """Faults that the text has: the rest is counted, and is in CSV and JSON."""
 
-NUMBERS_A_LINE = 4096
-"""Numbers of the list of episodes to leave out; a shell takes some 100,000 characters."""
-
 COLUMNS = ("episode", "fault", "joint", "times the limit", "what")
 
 
@@ -47,14 +44,14 @@ def closing(result: EpisodesResult) -> Iterator[str]:
         others = {fault.episode for fault in rest}
         yield f"and {len(rest)} more in {len(others)} episodes (--csv, --json)"
     if result.leave_out:
-        listed = str(result.leave_out)
+        listed = str([*result.leave_out])
         yield f"leave out: {listed}"
         yield (
             "  lerobot-edit-dataset --repo_id REPO --operation.type delete_episodes "
             f'--operation.episode_indices "{listed}"'
         )
     if result.not_judged:
-        numbers = [str(number) for number in result.not_judged]
+        numbers = [*result.not_judged]
         why = next(iter(result.not_judged.values()))
         yield f"not decided: episodes {some_names(numbers, 10)} ({why})"
     yield from (f"not decided: {limit}" for limit in result.limits)

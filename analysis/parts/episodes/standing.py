@@ -1,8 +1,9 @@
 """Signals that stand while they should move.
 
 In windows of a second the state should move by what its delayed command moves times the gain. It
-stands where it moves by less than a quarter of that, and the command stands where that moves by
-less than a quarter of what the state does.
+stands where it moves by less than a quarter of that from half a second before the window to half a
+second behind it; and the command stands where that moves by less than a quarter of what the state
+does.
 """
 
 from __future__ import annotations
@@ -31,23 +32,35 @@ def standing_of(
         By states that stand and by commands that stand, shape (k, m) each, in the states' unit.
     """
     half = max(round(WINDOW_S * fps / 2), 1)
-    asked = _ranges(regression.x, block, half) * np.abs(gain)
-    moved = _ranges(block.states, block, half)
-    frozen = np.where(moved < QUARTER * asked, asked, 0.0).max(axis=0, initial=0.0)
-    unasked = np.where(asked < QUARTER * moved, moved, 0.0).max(axis=0, initial=0.0)
-    return frozen, unasked
+    x = regression.x * np.abs(gain)
+    (asked, asked_around), (moved, moved_around) = (
+        _ranges(values, block, half) for values in (x, block.states)
+    )
+    frozen = np.where(moved_around < QUARTER * asked, asked, 0.0)
+    unasked = np.where(asked_around < QUARTER * moved, moved, 0.0)
+    return frozen.max(axis=0, initial=0.0), unasked.max(axis=0, initial=0.0)
 
 
-def _ranges(values: FloatArray, block: Block, half: int) -> FloatArray:
-    """Return the range of values in windows that overlap by half, shape (w, k, m).
+def _ranges(values: FloatArray, block: Block, half: int) -> tuple[FloatArray, FloatArray]:
+    """Return the range of values in windows of two halves, and with one more on either side.
 
-    A window that isn't wholly inside has none: it has the range 0.
+    The windows overlap by half. One that isn't wholly inside has none: its range is 0.
+
+    Returns:
+        Shape (w, k, m) each.
     """
-    starts = np.arange(0, len(values) - half + 1, half)[: len(values) // half]
-    if starts.size < 2:
-        return np.zeros((1, *values.shape[1:]))
-    whole = values[: starts.size * half].reshape(starts.size, half, *values.shape[1:])
-    high, low = whole.max(axis=1), whole.min(axis=1)
-    ranges = np.maximum(high[1:], high[:-1]) - np.minimum(low[1:], low[:-1])
-    inside = block.inside[starts[1:] + half - 1]
-    return ranges * inside[:, :, None]
+    count = len(values) // half
+    if count < 2:
+        none = np.zeros((1, *values.shape[1:]))
+        return none, none
+    halves = values[: count * half].reshape(count, half, *values.shape[1:])
+    high, low = halves.max(axis=1), halves.min(axis=1)
+    pairs = np.maximum(high[1:], high[:-1]), np.minimum(low[1:], low[:-1])
+    edges = np.r_[0, np.arange(count - 1), count - 2]  # the outer windows have one neighbour
+    before, after = edges[:-2], edges[2:]
+    around = (
+        np.maximum(pairs[0][before], pairs[0][after]),
+        np.minimum(pairs[1][before], pairs[1][after]),
+    )
+    inside = block.inside[half * np.arange(2, count + 1) - 1][:, :, None]
+    return (pairs[0] - pairs[1]) * inside, around[0] - around[1]
