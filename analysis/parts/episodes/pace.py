@@ -2,13 +2,13 @@
 
 Seen at the stated rate, an episode that was recorded at rho times it has all lags and all time
 constants rho times as long. Another delay, as of a loop that is a frame late, is the same for all
-joints, and the time constants stay. So the time constants decide, as far as they scatter less
-between sound episodes than the two differ by.
+joints, and the time constants stay. How far the motion shows the time constants, sound episodes
+tell: they are measured as they are with their states delayed, and as they are at the other rate.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,16 +49,48 @@ def pace_of(block: Block, sample: Block, response: Response, slower: float, late
         slower: Factor of the lags less 1.
         later: Median of the joints' delays [frames].
     """
-    moved = Response(response.delay + later, response.constant, response.play)
+    moved = replace(response, delay=response.delay + later)
     longer = float(constants_of(block, moved)[0])
-    sound = constants_of(sample, response)
-    usual = float(np.median(sound))
-    scatter = ROBUST * float(np.median(np.abs(sound - usual))) + TINY
-    limit = t_factor(max(sound.size - 1, 1)) * scatter * float(np.sqrt(1 + 1 / sound.size))
-    to_delay, to_rate = abs(longer - usual), abs(longer - usual - slower)
+    to_delay = _distance(longer, constants_of(shifted(sample, later), moved))
+    to_rate = _distance(longer, constants_of(paced(sample, 1 + slower), moved))
     near, far = sorted((to_delay, to_rate))
-    decided = sound.size >= FEWEST and far > max(limit, CLOSER * near)
+    count = sample.episodes.size
+    decided = count >= FEWEST and far > max(t_factor(count - 1), CLOSER * near)
     return Pace(to_rate < to_delay if decided else abs(later) < WHOLE_FRAME, decided)
+
+
+def _distance(value: float, sound: FloatArray) -> float:
+    """Return how far a value is from those of sound episodes, in their standard deviations."""
+    middle = float(np.median(sound))
+    scatter = ROBUST * float(np.median(np.abs(sound - middle)))
+    return abs(value - middle) / (scatter * float(np.sqrt(1 + 1 / sound.size)) + TINY)
+
+
+def shifted(block: Block, later: float) -> Block:
+    """Return episodes whose states are later [frames]."""
+    times = np.arange(len(block.states)) - later
+    return replace(block, states=_at(block.states, times))
+
+
+def paced(block: Block, rate: float) -> Block:
+    """Return episodes as they are at another rate, times the one that they have."""
+    times = np.arange(len(block.states)) / rate
+    whole = np.minimum(np.ceil(times), len(times) - 1).astype(np.int64)
+    inside = block.inside[whole] & (times <= len(times) - 1)[:, None]
+    return replace(
+        block,
+        inside=inside,
+        commands=_at(block.commands, times),
+        states=_at(block.states, times),
+    )
+
+
+def _at(values: FloatArray, times: FloatArray) -> FloatArray:
+    """Return values at times between the frames, by lines, shape (t, k, m)."""
+    places = np.clip(times, 0, len(values) - 1)
+    first = np.minimum(places.astype(np.int64), max(len(values) - 2, 0))
+    part = (places - first)[:, None, None]
+    return values[first] * (1 - part) + values[np.minimum(first + 1, len(values) - 1)] * part
 
 
 def constants_of(block: Block, response: Response) -> FloatArray:
