@@ -68,13 +68,13 @@ def _distance(value: float, sound: FloatArray) -> float:
 
 def shifted(block: Block, later: float) -> Block:
     """Return episodes whose states are later [frames]."""
-    times = np.arange(len(block.states)) - later
+    times: FloatArray = np.arange(len(block.states), dtype=np.float64) - later
     return replace(block, states=_at(block.states, times))
 
 
 def paced(block: Block, rate: float) -> Block:
     """Return episodes as they are at another rate, times the one that they have."""
-    times = np.arange(len(block.states)) / rate
+    times: FloatArray = np.arange(len(block.states), dtype=np.float64) / rate
     whole = np.minimum(np.ceil(times), len(times) - 1).astype(np.int64)
     inside = block.inside[whole] & (times <= len(times) - 1)[:, None]
     return replace(
