@@ -128,7 +128,8 @@ def run_batch(
     Args:
         scenarios: The runs; what they give stays in memory, 80 bytes a joint and tick.
         commands: Of each run at its k ticks [rad], shape (k, m), in place of its gait's; they are
-            held from tick to tick.
+            held from tick to tick. Or of p equal parts of each control period, shape (k p, m), p a
+            divisor of the physics steps of a period: what a servo has on average during each part.
         dtype: ``float64``, or ``float32`` for gains and lags within 1e-3 at a higher speed.
         device: ``cpu``: one core; ``cuda``: an NVIDIA GPU (package numba-cuda), for
             thousands of runs: results agree with the CPU's within rounding, not bit for bit.
@@ -156,14 +157,10 @@ def run_batch(
             for scenario, one in zip(scenarios, commands, strict=True)
         ]
     for scenario, one in zip(scenarios, commands, strict=True):
-        if one.shape != (scenario.tick_count, len(scenario.robot.joints)):
-            raise ValueError(
-                f"commands of shape {one.shape}; expected {scenario.tick_count} ticks of "
-                f"{len(scenario.robot.joints)} joints"
-            )
+        _check_shape(one, scenario)
     groups: dict[_Shape, list[int]] = {}
-    for i, scenario in enumerate(scenarios):
-        groups.setdefault(_shape(scenario), []).append(i)
+    for i, (scenario, rows) in enumerate(zip(scenarios, commands, strict=True)):
+        groups.setdefault((*_shape(scenario), len(rows)), []).append(i)
     runs: dict[int, BatchRun] = {}
     for group in groups.values():
         one = scenarios[group[0]]
@@ -216,6 +213,18 @@ def _shape(scenario: Scenario) -> _Shape:
     law = None if ground is None else ground.law
     planes = tuple(joint.plane for joint in scenario.robot.joints)
     return planes, law, scenario.physics_rate_hz, scenario.tick_count
+
+
+def _check_shape(commands: FloatArray, scenario: Scenario) -> None:
+    """Raise for commands that fit neither ticks nor equal parts of the control periods."""
+    steps, ticks = scenario.physics_rate_hz // CONTROL_RATE_HZ, scenario.tick_count
+    parts, rest = divmod(len(commands), ticks)
+    whole = parts > 0 and rest == 0 and steps % parts == 0
+    if not whole or commands.shape[1:] != (len(scenario.robot.joints),):
+        raise ValueError(
+            f"commands of shape {commands.shape}; expected {ticks} ticks of "
+            f"{len(scenario.robot.joints)} joints, or equal parts of them that divide {steps} steps"
+        )
 
 
 def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
@@ -275,7 +284,8 @@ class _Block:
         self._carried = np.zeros((CARRIED_ROWS, width), dtype)
         self._ground = np.zeros((GROUND_ROWS, width), dtype)
         self._gravity = np.zeros((3, width), dtype)
-        self._commands = np.zeros((ticks, m, width), dtype)
+        self._commands = np.zeros((len(commands[0]), m, width), dtype)
+        self._parts = len(commands[0]) // ticks
         self._samples = np.zeros((ticks, SAMPLE_ROWS, m, width), dtype)
         self._poses = np.zeros((ticks, HEAD_ROWS, width), dtype)
         self._failure = np.full((4, width), -1.0)
@@ -295,7 +305,7 @@ class _Block:
 
     def run(self, advance: Callable[..., None]) -> None:
         """Run to the end, or until all have failed."""
-        ticks, n = len(self._commands), len(self._scenarios)
+        ticks, n = len(self._samples), len(self._scenarios)
         limits = np.array([MAX_ROTOR_SPEED, MAX_SPEED**2])
         step_s = 1.0 / self._scenarios[0].physics_rate_hz
         for first in range(0, ticks - 1, _TICKS_A_CALL):
@@ -303,9 +313,10 @@ class _Block:
                 return
             last = min(first + _TICKS_A_CALL, ticks - 1)
             part = slice(first, last + 1)
+            given = slice(first * self._parts, last * self._parts + 1)
             advance(
                 *(self._links, self._head, self._carried, self._ground, self._gravity),
-                *(self._vertical, self._law, self._commands[part], self._samples[part]),
+                *(self._vertical, self._law, self._commands[given], self._samples[part]),
                 *(self._poses[part], self._failure, limits, step_s, self._steps, first, last),
                 self._head.shape[1],
             )
@@ -316,7 +327,8 @@ class _Block:
         # All runs at once: a run's numbers are far apart in a block.
         samples = np.ascontiguousarray(self._samples.transpose(3, 1, 0, 2), np.float64)
         poses = np.ascontiguousarray(self._poses.transpose(2, 0, 1), np.float64)
-        commands = np.ascontiguousarray(self._commands.transpose(2, 0, 1), np.float64)
+        commands = self._commands[:: self._parts]  # at the ticks
+        commands = np.ascontiguousarray(commands.transpose(2, 0, 1), np.float64)
         samples[:, 2:5, 1:-1] /= steps
         samples[:, 2:5, [0, -1]] /= steps / 2
         for r, scenario in enumerate(self._scenarios):
@@ -337,7 +349,7 @@ class _Block:
         """Why a run failed, and how many ticks it has: those before the period in which it did."""
         step, of_link, place, value = self._failure[:, r].tolist()
         if step < 0:
-            return None, len(self._commands)
+            return None, len(self._samples)
         scenario = self._scenarios[r]
         parts = scenario.robot.links if of_link else scenario.robot.joints
         speed = value**0.5 if of_link else value

@@ -308,7 +308,8 @@ def run_lanes(
         gravity: [m/s^2], shape (3, lanes).
         vertical: Whether a joint turns about y rather than z, shape (m,).
         law: Number of the friction law.
-        commands: q_ref from each tick on [rad], shape (ticks, m, lanes); ticks first to last.
+        commands: q_ref from each tick on, or during each of p equal parts of a control period
+            [rad], shape (p (last - first) + 1, m, lanes); p divides ``steps``.
         samples: Filled in but for the first tick, which is completed, shape
             (ticks, :data:`SAMPLE_ROWS`, m, lanes); effort, current and voltage are sums.
         poses: Filled in, but for the first: the head, shape (ticks, :data:`HEAD_ROWS`, lanes).
@@ -321,13 +322,16 @@ def run_lanes(
         last: The period after the last one; its tick is filled in.
     """
     dt = links.dtype.type(step_s)
+    parts = (len(commands) - 1) // (last - first)
     for tick in range(last - first):
         samples[tick + 1, 2:5] = _ZERO
         for part in range(2):
             for k in range(steps // 2):
-                step = (first + tick) * steps + part * (steps // 2) + k
+                within = part * (steps // 2) + k
+                step = (first + tick) * steps + within
+                row = tick * parts + within * parts // steps
                 for i in range(1, len(links)):
-                    _servo(links[i], commands[tick, i - 1], carried, i - 1, dt, lanes)
+                    _servo(links[i], commands[row, i - 1], carried, i - 1, dt, lanes)
                 _note(carried, failure, step, limits[0], 0, lanes)
                 _forward(links, head, carried, ground, vertical, law, lanes)
                 _note(carried, failure, step, limits[1], 1, lanes)

@@ -110,8 +110,12 @@ class Plant:
         """
         self._laws.command(0, reference)
 
-    def advance(self) -> Steps:
+    def advance(self, references: FloatArray | None = None) -> Steps:
         """Go through one control period.
+
+        Args:
+            references: Joint angles q_ref during each of its steps [rad], shape (k, m), the first
+                row as :meth:`command` gave it; None: that command is held.
 
         Returns:
             Its steps from its start to its end, both included, in a table of their own; all of
@@ -124,12 +128,15 @@ class Plant:
             way = MAX_SPEED * (times_s[-1] - times_s[0]) * _MARGIN
             self._near = self._obstacle_law.reachable(self._rows[0].body.position, way)
         self._periods += 1
+        changes = () if references is None else _changes(references)
         with np.errstate(all="ignore"):  # whoever looks at the steps finds what overflows
             for k in range(1, len(self._rows)):
                 self._push(k - 1)
                 self._engine.step(self._rows[k - 1].drive.torque)
                 self._look(k)
                 self._laws.follow(k)
+                if references is not None and k in changes:
+                    self._laws.command(k, references[k])
         steps = self._period.copy()
         self._period.table[0] = self._period.table[-1]
         self._period.obstacles[0] = self._period.obstacles[-1]
@@ -150,6 +157,12 @@ class Plant:
         body = self._engine.read(self._rows[k].body)
         if self._near is not None:
             self._period.obstacles[k] = self._near(*body[:4])
+
+
+def _changes(references: FloatArray) -> frozenset[int]:
+    """Rows that differ from the row before them."""
+    changed = (references[1:] != references[:-1]).any(axis=1)
+    return frozenset((np.flatnonzero(changed) + 1).tolist())
 
 
 def resting_height(scenario: Scenario) -> float:
@@ -247,7 +260,7 @@ class Twin:
             time_s = tick / CONTROL_RATE_HZ
             if tick:
                 steps = self._plant.advance()
-                self._check(steps, time_s - 1 / CONTROL_RATE_HZ)
+                check_state(steps, self.scenario, time_s - 1 / CONTROL_RATE_HZ)
                 self._ledger.book(steps)
                 self.sensed = self._sensing.observe(steps)
             gait = self.gait.step(time_s, self._sensing.readings)
@@ -266,22 +279,29 @@ class Twin:
         """
         return self._sensing.flush()
 
-    def _check(self, steps: Steps, start_s: float) -> None:
-        """Refuse an impossible state."""
-        motion, rotors = np.abs(steps.links[:, 7:10]), np.abs(steps.motors[:, 1])
-        if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
-            return
-        speed = motion.max(axis=1)
-        sound = rotors <= MAX_ROTOR_SPEED  # false for NaN
-        k = int(np.argmin(sound.all(axis=1) & (speed <= MAX_SPEED).all(axis=1)))
-        time_s = start_s + k * self._plant.dt
-        if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
-            joint = int(np.argmax(rotors[k]))  # NaN before all numbers
-            raise failure(
-                self.scenario, time_s, self.scenario.robot.joints[joint], rotors[k, joint]
-            )
-        link = int(np.argmax(speed[k]))
-        raise failure(self.scenario, time_s, self.scenario.robot.links[link], speed[k, link])
+
+def check_state(steps: Steps, scenario: Scenario, start_s: float) -> None:
+    """Refuse an impossible state.
+
+    Args:
+        steps: Of a control period.
+        start_s: Its start [s].
+
+    Raises:
+        SimulationError: If a link or a servo is too fast; names the first.
+    """
+    motion, rotors = np.abs(steps.links[:, 7:10]), np.abs(steps.motors[:, 1])
+    if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
+        return
+    speed = motion.max(axis=1)
+    sound = rotors <= MAX_ROTOR_SPEED  # false for NaN
+    k = int(np.argmin(sound.all(axis=1) & (speed <= MAX_SPEED).all(axis=1)))
+    time_s, robot = start_s + k / scenario.physics_rate_hz, scenario.robot
+    if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
+        joint = int(np.argmax(rotors[k]))  # NaN before all numbers
+        raise failure(scenario, time_s, robot.joints[joint], rotors[k, joint])
+    link = int(np.argmax(speed[k]))
+    raise failure(scenario, time_s, robot.links[link], speed[k, link])
 
 
 def failure(scenario: Scenario, time_s: float, part: Joint | Link, speed: float) -> SimulationError:

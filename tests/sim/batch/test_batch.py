@@ -5,6 +5,7 @@ import math
 import os
 import pickle
 import re
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from undulog.sim.scenario.obstacles import Cylinder
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.scenario.scenario_file import scenario_names
 from undulog.sim.scenario.world import Push
+from undulog.sim.twin.twin import Plant
 
 pytestmark = pytest.mark.slow  # the first of them waits for its compiler, half a minute
 
@@ -265,6 +267,27 @@ def test_given_commands_run_as_the_gait_that_gives_them(weak):
         np.testing.assert_array_equal(getattr(run, name), getattr(own, name))
     with pytest.raises(ValueError, match=r"expected \d+ ticks of"):
         run_batch([weak], commands=[own.command[:-1]])
+
+
+def test_commands_within_control_periods_are_those_of_the_twins_plant(weak):
+    """Ten parts of a period: as the plant steps them, and held ones bit for bit as from ticks."""
+    weak = dataclasses.replace(weak.changed(duration_s=0.3), engine=EngineKind.MUJOCO)
+    (whole,) = run_batch([weak])
+    held = np.repeat(whole.command, 10, axis=0)
+    ramp = held + 0.02 * np.sin(np.arange(len(held)))[:, None]
+    same, driven = run_batch([weak, weak], commands=[held, ramp])
+    np.testing.assert_array_equal(same.angle, whole.angle)
+    np.testing.assert_array_equal(driven.command, ramp[::10])
+    angles = [np.zeros(ramp.shape[1])]
+    with closing(Plant(weak, Kernels.NUMBA)) as plant:
+        for tick in range(weak.tick_count - 1):
+            plant.command(ramp[10 * tick])
+            steps = plant.advance(ramp[10 * tick : 10 * tick + 10])
+            angles.append(steps.motion[-1, 0])
+    assert np.abs(driven.angle - whole.angle).max() > 1e-4
+    np.testing.assert_allclose(driven.angle, angles, atol=1e-12)
+    with pytest.raises(ValueError, match="equal parts of them that divide 10 steps"):
+        run_batch([weak], commands=[held[: len(held) // 10 * 3]])
 
 
 def test_what_a_batch_cannot_run_is_refused_by_name(weak):

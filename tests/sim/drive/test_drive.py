@@ -15,7 +15,7 @@ from support.written_sessions import write_commands
 from undulog import sim
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
-from undulog.sim.drive.motion import CommandReplay, RecordedCommands
+from undulog.sim.drive.recorded_commands import CommandReplay, RecordedCommands
 
 TOPICS = ("/joint_commands", "/joint_current", "/joint_voltage", "/gait", "/energy_ledger")
 COLUMNS = (

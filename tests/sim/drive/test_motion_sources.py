@@ -20,8 +20,9 @@ from undulog.capture.common.errors import (
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Plane
 from undulog.sim.drive.dry_run import nominal_world
-from undulog.sim.drive.motion import CommandReplay, find_motion
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.drive.plan import PlanGait
+from undulog.sim.drive.recorded_commands import CommandReplay
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.adaptive import build_gait
 
