@@ -112,7 +112,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "sim list": ("sim run:list_scenarios", "List the shipped scenarios."),
     "sim show": ("sim run:show", "Show a scenario: every value with its unit."),
     "sim run": ("sim run:run", "Simulate a scenario and record it."),
-    "sim fit": ("replay fit:fit", "Fit the twin's servo and friction to a session."),
+    "sim fit": ("replay fit:fit", "Fit the twin's servo and friction to sessions."),
     "sim null": ("sim run:null", "Model identical modules, for analyse --null."),
     "sim serve": ("sim serve:serve", "Be a robot on a bus, in real time."),
     "drive": ("sim drive:drive", "Drive a gait, a plan or recorded commands."),

@@ -28,8 +28,9 @@ to first order in d; g is what the robot's amplitude is larger by, d how much la
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -37,8 +38,8 @@ from scipy.special import chdtrc, fdtrc
 from undulog.capture.common.arrays import FloatArray
 
 from .identifiability import Alternative
-from .parameters import Measured
-from .solve import LeastSquares, deviations
+from .least_squares import LeastSquares, larger
+from .recorded import Measured
 
 _STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
@@ -103,17 +104,19 @@ class JointFit:
 
 @dataclass(frozen=True)
 class Unfitted:
-    """Halves of the session that predict each other.
+    """Halves of what was recorded, or sessions, that predict each other.
 
     Attributes:
         p: Of 'both halves ask for the same parameters'.
         fitted_rad: RMS of the residual where the fit of all was made [rad].
         unfitted_rad: That of each half under the parameters of the other [rad].
+        by_session: Whether these are a session and the others, instead of halves.
     """
 
     p: float
     fitted_rad: float
     unfitted_rad: float
+    by_session: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,13 +126,13 @@ class LackOfFit:
     Attributes:
         joints: Joint to what is left there.
         unfitted: The halves; None where one is too short.
-        gait_hz: Frequency that was looked at; None where there is no steady gait.
+        gaits_hz: Frequencies that were looked at, of the sessions that have a steady gait.
     """
 
     joints: dict[str, JointFit]
     unfitted: Unfitted | None
     alternatives: tuple[Alternative, ...]
-    gait_hz: float | None
+    gaits_hz: tuple[float, ...]
 
     @property
     def p(self) -> float:
@@ -149,6 +152,17 @@ class LackOfFit:
         return self.p < LEVEL
 
     @property
+    def explanation(self) -> Alternative | None:
+        """What explains most of the misfit, if something is shown that may be named."""
+        shown = [
+            other
+            for other in self.alternatives
+            if other.could_explain
+            and other.p * sum(a.widens is other.widens for a in self.alternatives) < LEVEL
+        ]
+        return min(shown, key=lambda other: other.left, default=None)
+
+    @property
     def worst(self) -> str:
         """The joint that fits worst."""
         joints = self.joints
@@ -158,7 +172,7 @@ class LackOfFit:
 def lack_of_fit(
     measured: Measured,
     residuals: Sequence[FloatArray],
-    omega: float | None,
+    omegas: Sequence[float | None],
     unfitted: Unfitted | None,
     others: tuple[Alternative, ...] = (),
 ) -> LackOfFit:
@@ -167,18 +181,19 @@ def lack_of_fit(
     Args:
         measured: Angles of r joints.
         residuals: [rad], shapes (n_j,).
-        omega: Of the gait [rad/s]; None where there is none.
+        omegas: Of each joint's gait [rad/s]; None where there is none.
         unfitted: From :func:`halves`.
         others: From :func:`.replay.calibrate.identifiability.alternatives`.
     """
     found: dict[str, JointFit] = {}
-    rows = zip(measured.joints, measured.times_s, measured.angles, residuals, strict=True)
-    for joint, t, angle, rest in rows:
+    rows = zip(measured.joints, measured.times_s, measured.angles, residuals, omegas, strict=True)
+    for joint, t, angle, rest, omega in rows:
         if omega is not None and float(t[-1] - t[0]) * omega / (2 * np.pi) >= FEWEST_CYCLES:
             found[joint] = periodic(t, rest, omega, step_of(angle))
         else:
             found[joint] = JointFit(ljung_box(rest), None)
-    return LackOfFit(found, unfitted, others, None if omega is None else omega / (2 * np.pi))
+    gaits = tuple({omega / (2 * np.pi): None for omega in omegas if omega is not None})
+    return LackOfFit(found, unfitted, others, gaits)
 
 
 def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.0) -> JointFit:
@@ -254,43 +269,73 @@ def ljung_box(residual: FloatArray) -> float:
     return float(chdtrc(count - 1, statistic))
 
 
-def halves(
-    columns: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    x: FloatArray,
-    precision: FloatArray,
-) -> Unfitted | None:
-    """Fit each half by itself, and predict the other.
+def halves(problem: LeastSquares, x: FloatArray, sessions: Sequence[int] = ()) -> Unfitted | None:
+    """Fit a part of what was recorded by itself, and predict the rest; and the other way round.
+
+    The parts are the halves of each series; of several sessions, also each session and the others.
 
     Args:
-        columns: Derivatives of the twin's angles at the fit, shapes (n_j, K).
-        residuals: [rad], shapes (n_j,).
-        x: The fit, shape (K,).
-        precision: Diagonal of the prior's inverse covariance, shape (K,).
+        problem: What the fit of all leaves.
+        x: That fit, shape (K,).
+        sessions: Number of each series' session; all the same if empty.
 
     Returns:
-        The check; None where half of the session is too short for K parameters.
+        The pair of parts that agrees least, its p family-wise; None where half of what there is is
+        too short for K parameters.
     """
     count = len(x)
-    middle = min(map(len, residuals)) // 2
-    parts = [slice(None, middle), slice(middle, None)]
-    if sum(len(r[parts[0]]) for r in residuals) <= 4 * count or not count:
+    lengths = list(map(len, problem.residuals))
+    pairs = [(_part(problem, a), _part(problem, b)) for a, b in _pairs(lengths, sessions)]
+    long_enough = [pair for pair in pairs if min(_size(part) for part in pair) > 4 * count]
+    if not long_enough or not count:
         return None
-    sigma = deviations(residuals)
-    prior = np.diag(precision)
+    compared = [_compared(*pair, x) for pair in long_enough]
+    p, unfitted_rad = min(compared)
+    by_session = pairs[0] is not long_enough[compared.index((p, unfitted_rad))]
+    fitted_rad = _rms(problem.residuals)
+    return Unfitted(min(1.0, len(compared) * p), fitted_rad, unfitted_rad, by_session)
+
+
+_Slices: TypeAlias = Sequence[slice]
+
+
+def _pairs(lengths: Sequence[int], sessions: Sequence[int]) -> Iterator[tuple[_Slices, _Slices]]:
+    """Yield pairs of parts, a slice of each series: halves, then a session and the others."""
+    yield [slice(n // 2) for n in lengths], [slice(n // 2, None) for n in lengths]
+    numbers = sorted(set(sessions))
+    for number in numbers if len(numbers) > 2 else numbers[1:]:
+        within = [slice(None if k == number else 0) for k in sessions]
+        yield within, [slice(0 if k == number else None) for k in sessions]
+
+
+def _part(problem: LeastSquares, slices: _Slices) -> LeastSquares:
+    """The problem of a part; where an encoder has its zero is the part's own affair, too."""
+    rows = zip(problem.columns, problem.residuals, problem.sigma.tolist(), slices, strict=True)
+    parts = [(c[s], r[s], deviation) for c, r, deviation, s in rows if len(r[s])]
+    return LeastSquares(
+        [c - c.mean(axis=0) for c, _, _ in parts],
+        [r - r.mean() for _, r, _ in parts],
+        np.array([deviation for _, _, deviation in parts]),
+        problem.precision,
+    )
+
+
+def _size(part: LeastSquares) -> int:
+    return sum(map(len, part.residuals))
+
+
+def _compared(first: LeastSquares, second: LeastSquares, x: FloatArray) -> tuple[float, float]:
+    """Return p of 'both ask for the same parameters', and the RMS under the other's [rad]."""
+    prior = np.diag(first.precision)
     steps: list[FloatArray] = []
     inverses: list[FloatArray] = []
-    covariance = np.zeros((count, count))
-    for part in parts:
-        # Where an encoder has its zero is a half's own affair, too.
-        J = [column[part] - column[part].mean(axis=0) for column in columns]
-        rest = [r[part] - r[part].mean() for r in residuals]
-        half = LeastSquares(J, rest, sigma, precision)
-        normal = half.normal
+    covariance = np.zeros_like(prior)
+    for part in (first, second):
+        normal = part.normal
         inverse: FloatArray = np.linalg.inv(normal).astype(np.float64)
         # Never less than white noise has it, as in the fit itself.
-        covariance += inverse @ _larger(half.scores(), normal - prior) @ inverse
-        steps.append(inverse @ (half.slope - precision * x))
+        covariance += inverse @ larger(part.scores(), normal - prior) @ inverse
+        steps.append(inverse @ (part.slope - part.precision * x))
         inverses.append(inverse)
     apart = inverses[0] - inverses[1]
     covariance += apart @ prior @ apart
@@ -299,21 +344,11 @@ def halves(
     scaled = difference / scale
     statistic = float(scaled @ np.linalg.pinv(covariance / np.outer(scale, scale)) @ scaled)
     unfitted = [
-        (r[part] - r[part].mean()) - (c[part] - c[part].mean(axis=0)) @ steps[other]
-        for part, other in zip(parts, (1, 0), strict=True)
-        for r, c in zip(residuals, columns, strict=True)
+        r - c @ step
+        for part, step in ((first, steps[1]), (second, steps[0]))
+        for r, c in zip(part.residuals, part.columns, strict=True)
     ]
-    return Unfitted(float(chdtrc(count, statistic)), _rms(residuals), _rms(unfitted))
-
-
-def _larger(scores: FloatArray, white: FloatArray) -> FloatArray:
-    """The larger of two covariances, direction by direction."""
-    values, vectors = np.linalg.eigh(white + 1e-12 * np.trace(white) * np.eye(len(white)))
-    root = vectors * np.sqrt(values)
-    back = vectors / np.sqrt(values)
-    share, turn = np.linalg.eigh(back.T @ scores @ back)
-    spread = root @ turn
-    return (spread * np.maximum(share, 1.0)) @ spread.T
+    return float(chdtrc(len(x), statistic)), _rms(unfitted)
 
 
 def _waves(t: FloatArray, omega: float) -> FloatArray:

@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 
 
 def fit(
-    file: Path,
-    /,
-    *,
+    *files: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     on: str = "twin",
     scenario: Path | None = None,
@@ -40,18 +38,19 @@ def fit(
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Fit the twin's servo and friction to a session, so that it answers as the robot did.
+    """Fit the twin's servo and friction to sessions, so that it answers as the robot did.
 
-    The session's commands are given to the twin again and again, its parameters changed until its
-    joint angles match the recorded ones. Each parameter comes with a 95 % interval, and those that
-    the session does not determine are named, with what would determine them. The written robot
+    The sessions' commands are given to the twin again and again, at their own times, its parameters
+    changed until its joint angles match the recorded ones. Several sessions of one robot share all
+    parameters. Each parameter comes with a 95 % interval, and those that
+    the sessions do not determine are named, with what would determine them. The written robot
     description has the fitted servo; the ground's friction belongs to a scenario: `--scenario`.
 
     Example: `undulog sim fit run.mcap --on twin:flat --modules -o fitted.toml`
 
     Args:
-        file: The session, `.mcap`: commands and joint states, of a robot or of the twin.
-        on: `twin:SCENARIO` to start from, or `twin`, the world that it was recorded in.
+        files: Sessions, `.mcap`: commands and joint states, of a robot or of the twin.
+        on: `twin:SCENARIO` to start from, or `twin`, the world that each was recorded in.
         output: The robot description to write, `.toml`.
         scenario: The scenario to write, with the fitted ground and module, `.toml`.
         only: A parameter to fit, e.g. `stall_torque`; may be given several times. All by default:
@@ -62,12 +61,14 @@ def fit(
         delay: Fit a dead time, too; the twin has none, so it is reported and not written.
         spread: Relative standard deviation of the parameters, as known before the session.
         within: A parameter counts as determined if its interval is within this share of it.
-        settle: The first seconds to leave out, instead of the session's own.
+        settle: The first seconds of each session to leave out, instead of its own.
         topics: Where commands and responses are; commands are never found by type.
         kernels: What computes the forces: `numba` is faster; `auto` takes it where it is installed.
         force: Replace the outputs if they are there.
         json: Print one JSON object instead of text.
     """
+    if not files:
+        raise UsageError("give one or several sessions, .mcap")
     _check(output, scenario, spread, within, one=module is not None and modules)
     scheme, colon, world = on.partition(":")
     if scheme != "twin" or bool(colon) != bool(world):
@@ -77,13 +78,15 @@ def fit(
             refuse_existing(path, force=force)
     from undulog.sim.scenario.scenario import Kernels
 
-    from ..calibrate.fit import Wanted, calibrate, write_calibration
+    from ..calibrate.fit import Wanted, calibrate
+    from ..calibrate.written import write_calibration
 
     compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     wanted = Wanted(tuple(only or ()), module, modules, delay, spread, within, settle)
-    with interruptible() as stop, progress(f"fit to {file.name}", 1.0) as bar:
+    names = ", ".join(file.name for file in files)
+    with interruptible() as stop, progress(f"fit to {names}", 1.0) as bar:
         calibration = calibrate(
-            file,
+            files,
             world or None,
             wanted,
             topics=topics.names,
@@ -132,7 +135,8 @@ def _summary(calibration: Calibration) -> Iterator[str]:
     if calibration.lack.found:
         yield from _lack(calibration.lack)
     yield (
-        f"{calibration.session} in {calibration.world}: twin and robot are {before:.3g} rad apart "
+        f"{', '.join(calibration.sessions)} in {calibration.world}: "
+        f"twin and robot are {before:.3g} rad apart "
         f"(RMS) before, {after:.3g} rad after; {calibration.iterations} iterations, "
         f"{calibration.runs} runs at {calibration.speed:.1f} x real time"
     )
@@ -160,7 +164,8 @@ def _facts(calibration: Calibration) -> dict[str, Any]:
     """Return the calibration as plain JSON values, in SI units."""
     search, lack = calibration.search, calibration.lack
     return {
-        "session": calibration.session,
+        "session": calibration.sessions[0],
+        "sessions": list(calibration.sessions),
         "world": calibration.world,
         "parameters": [
             {key: value for key, value in vars(one).items() if key != "label"}
@@ -180,7 +185,8 @@ def _facts(calibration: Calibration) -> dict[str, Any]:
         "lack_of_fit": {
             "p": lack.p,
             "worst": lack.worst,
-            "gait_hz": lack.gait_hz,
+            "explanation": None if lack.explanation is None else lack.explanation.label,
+            "gait_hz": lack.gaits_hz[0] if lack.gaits_hz else None,
             "joints": {joint: vars(one) for joint, one in lack.joints.items()},
             "alternatives": [
                 {"label": one.label, "size": one.size, "ci95": one.ci95, "p": one.p}
@@ -189,6 +195,7 @@ def _facts(calibration: Calibration) -> dict[str, Any]:
             "unfitted": None if lack.unfitted is None else vars(lack.unfitted),
         },
         "rms_rad": {"before": _rms(calibration.before), "after": _rms(calibration.after)},
+        "half_step_rms_rad": calibration.step.rms,
         "residual_memory_samples": calibration.memory,
         "iterations": calibration.iterations,
         "converged": calibration.converged,
@@ -202,10 +209,9 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
     from ..calibrate.lack_of_fit import LEVEL
 
     parts: list[str] = []
-    if lack.alternatives:
-        best = min(lack.alternatives, key=lambda one: one.p)
-        if sum(one.widens is best.widens for one in lack.alternatives) * best.p < LEVEL:
-            parts.append(f"{best.label} would fit better ({_size(best)})")
+    if (best := lack.explanation) is not None:
+        taken = f"takes {100 * (1 - best.left):.0f} % of what is left"
+        parts.append(f"{best.label} would fit better ({_size(best)}; {taken})")
     if off := [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]:
         periodic = lack.joints[lack.worst].periodic_rad
         size = "" if periodic is None else f" by {periodic:.2g} rad (RMS)"
@@ -213,8 +219,9 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
         others = f" and {len(off) - 1} more" if len(off) > 1 else ""
         parts.append(f"what is left at {lack.worst}{others} {how}{size}")
     if lack.unfitted is not None and lack.unfitted.p < LEVEL:
+        parts_of = "sessions" if lack.unfitted.by_session else "the two halves of the session"
         parts.append(
-            "the two halves of the session ask for different parameters "
+            f"{parts_of} ask for different parameters "
             f"({lack.unfitted.unfitted_rad:.3g} rad off where not fitted, "
             f"{lack.unfitted.fitted_rad:.3g} where fitted)"
         )
@@ -237,11 +244,14 @@ def _size(other: Alternative) -> str:
 def _checked(lack: LackOfFit) -> Iterator[str]:
     if lack.found:
         return
-    what = "the gait's harmonics" if lack.gait_hz is not None else "the residual's memory"
+    what = "the gait's harmonics" if lack.gaits_hz else "the residual's memory"
     off = ""
     if lack.unfitted is not None:
         size = lack.unfitted.unfitted_rad
-        off = f"; each half under the parameters of the other is {size:.3g} rad off"
+        other_part = "each session under the parameters of the others"
+        if not lack.unfitted.by_session:
+            other_part = "each half under the parameters of the other"
+        off = f"; {other_part} is {size:.3g} rad off"
     if open_laws := [one.label for one in lack.alternatives if one.widens and one.could_be]:
         yield (
             f"Not determined by this session: {' or '.join(open_laws)} would do as well; "

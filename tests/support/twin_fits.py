@@ -8,12 +8,24 @@ from support import twin_chains
 from undulog.capture import Session, SessionWriter
 
 
-def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), seed=2):
+def room_for(
+    folder,
+    joints,
+    duration,
+    hidden,
+    *,
+    noise=0.005,
+    gait=(0.4, 1.0),
+    seed=2,
+    stall=0.3,
+    rate_hz=1000,
+):
     """Write a nominal world, and record a session of one with other parameters.
 
+    The session is of a twin at the physics rate ``rate_hz``; the nominal one has 1 kHz.
     The checks whether a twin fits have a level of 5 %: one noise in twenty is taken for a misfit.
     """
-    servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}
+    servo = {"stall_torque": stall, "gear_stiffness": 12.0, "gear_damping": 0.008}
     robot = twin_chains.chain(joints, planes=["horizontal"], **servo)
     noted = robot.replace("[defaults.servo]", "[defaults.servo]  # of the data sheet")
     (folder / "robot.toml").write_text(noted)
@@ -27,7 +39,8 @@ def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), 
         noise={"position": noise},
     )
     (folder / "nominal.toml").write_text(world)
-    (folder / "hidden.toml").write_text(world + hidden)
+    finer = f"physics_rate_hz = {rate_hz}\n" + world
+    (folder / "hidden.toml").write_text(finer + hidden)
     words = ["sim", "run", str(folder / "hidden.toml"), "-o", str(folder / "run.mcap")]
     assert front.run([*words, "--seed", str(seed), "--kernels", "numba"]) == 0
     return folder
@@ -52,6 +65,42 @@ def rewritten(source, target, change):
                 t_ns, rows = change(t_ns, rows)
             for one, row in zip(t_ns.tolist(), rows, strict=True):
                 channel.write(one, row)
+
+
+def restamped(source, target, stamps, *, noise=0.0, seed=0):
+    """Write a session again with other stamps: ``stamps`` of a generator and times [ns].
+
+    The rows depend on noise and seed only.
+    """
+    of_rows, of_stamps = (np.random.default_rng([seed, k]) for k in range(2))
+    with Session.open(source) as session:
+        topics = {t: session.joints(t) for t in ("/joint_commands", "/joint_states")}
+        robot = session.robot
+    epoch_ns = int(topics["/joint_commands"].t_ns[0][0])
+    with SessionWriter(target, session_id=target.stem, epoch_ns=epoch_ns, robot=robot) as writer:
+        for topic, signals in topics.items():
+            channel = writer.joint_state(topic, signals.names, unit="rad")
+            rows = np.array(signals.values).T.copy()
+            if topic == "/joint_states":
+                rows += noise * of_rows.standard_normal(rows.shape)
+            for t_ns, row in zip(stamps(of_stamps, signals.t_ns[0]).tolist(), rows, strict=True):
+                channel.write(t_ns, row)
+    return target
+
+
+def exact(_random, t_ns):
+    """Stamps as they were."""
+    return t_ns
+
+
+def rounded(random, t_ns):
+    """Stamps that went through seconds in double precision: off by up to 114 ns."""
+    return t_ns + random.integers(-114, 115, t_ns.size)
+
+
+def jittered(random, t_ns):
+    """Stamps off by 0.4 ms (standard deviation)."""
+    return t_ns + np.round(4e5 * random.standard_normal(t_ns.size)).astype(np.int64)
 
 
 def colored(random, rho, *shape):

@@ -14,8 +14,9 @@ from undulog.capture import load_robot
 from undulog.capture.common.process import StopRequest
 from undulog.replay.calibrate.identifiability import ridges
 from undulog.replay.calibrate.lack_of_fit import misfit
+from undulog.replay.calibrate.least_squares import LeastSquares, LinearFit, memory
 from undulog.replay.calibrate.parameters import Unknown
-from undulog.replay.calibrate.solve import LeastSquares, memory, solve
+from undulog.replay.calibrate.solve import solve
 from undulog.replay.commands import fit as cli
 from undulog.sim.scenario.scenario_file import load_scenario
 
@@ -225,6 +226,30 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     got = LeastSquares([column], [noise], np.ones(1), np.ones(1)).scores()
     spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_scores_of_noise_that_joints_share_add_up(shared):
+    """Of r equal columns: r times the variance where noise is each joint's, r^2 where shared."""
+    random, n, joints = np.random.default_rng(6), 20000, 5
+    column = np.cos(0.06 * np.arange(n))[:, None]
+    noise = random.standard_normal((joints, n))
+    noise[1:] = noise[0] if shared else noise[1:]
+    rest = list(noise)
+    got = LeastSquares([column] * joints, rest, np.ones(joints), np.ones(1)).scores()
+    assert got[0, 0] == pytest.approx((joints**2 if shared else joints) * n / 2, rel=0.1)
+
+
+def test_one_more_parameter_is_that_of_least_squares():
+    random = np.random.default_rng(7)
+    columns, rest = random.standard_normal((2, 50, 3)), random.standard_normal((2, 50))
+    problem = LeastSquares(list(columns[..., :2]), list(rest), np.full(2, 0.5), np.full(2, 1e-9))
+    fitted = LinearFit(problem, np.zeros(2)).extended(list(columns[..., 2]), 1e5)
+    expected = np.linalg.lstsq(columns.reshape(100, 3), rest.reshape(100))[0]
+    np.testing.assert_allclose(fitted.x, expected, atol=1e-8)
+    left = rest.reshape(100) - columns.reshape(100, 3) @ expected
+    np.testing.assert_allclose(np.concatenate(fitted.problem.residuals), left, atol=1e-8)
+    assert fitted.problem.squares == pytest.approx(float(left @ left) / 0.25)
 
 
 @pytest.mark.nightly

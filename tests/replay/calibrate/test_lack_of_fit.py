@@ -9,7 +9,7 @@ import pytest
 
 from support import twin_fits
 from support.twin_fits import colored
-from undulog.replay.calibrate.identifiability import play_direction
+from undulog.replay.calibrate.identifiability import Alternative, play_direction
 from undulog.replay.calibrate.lack_of_fit import (
     JointFit,
     LackOfFit,
@@ -20,7 +20,8 @@ from undulog.replay.calibrate.lack_of_fit import (
     periodic,
     step_of,
 )
-from undulog.replay.calibrate.parameters import Measured
+from undulog.replay.calibrate.least_squares import LeastSquares, deviations
+from undulog.replay.calibrate.recorded import Measured
 
 SIGMA = 0.005
 OMEGA = 2 * np.pi
@@ -103,7 +104,8 @@ def linear(random, rho, *, apart=0.0, runs=60):
         slope = sum(c.T @ a for c, a in zip(columns, angles, strict=True)) / SIGMA**2
         x = np.linalg.solve(normal, slope)
         rest = [a - c @ x for a, c in zip(angles, columns, strict=True)]
-        found.append(halves(columns, rest, x, precision))
+        problem = LeastSquares(columns, rest, deviations(rest), precision)
+        found.append(halves(problem, x))
     return found
 
 
@@ -133,20 +135,59 @@ def test_play_lags_by_half_its_width():
 
 def test_the_level_is_of_all_joints_and_checks_together():
     joints = {"a": JointFit(0.02, 1e-4), "b": JointFit(0.5, 0.0)}
-    assert LackOfFit(joints, None, (), 1.0).p == pytest.approx(0.04)
-    assert LackOfFit(joints, Unfitted(0.9, 1e-3, 1e-3), (), 1.0).p == pytest.approx(0.08)
+    assert LackOfFit(joints, None, (), (1.0,)).p == pytest.approx(0.04)
+    assert LackOfFit(joints, Unfitted(0.9, 1e-3, 1e-3), (), (1.0,)).p == pytest.approx(0.08)
     plays = tuple(SimpleNamespace(p=p, widens=False) for p in (0.004, 0.3, 0.8))
-    both = LackOfFit(joints, Unfitted(0.9, 1e-3, 1e-3), plays, 1.0)
+    both = LackOfFit(joints, Unfitted(0.9, 1e-3, 1e-3), plays, (1.0,))
     assert both.p == pytest.approx(3 * 3 * 0.004)
     assert both.found
     assert both.worst == "a"
 
 
+def alternative(label, size, error, left, *, widens):
+    p = math.erfc(abs(size) / error / math.sqrt(2))
+    return Alternative(label, size, error, p, np.zeros(1), np.eye(1), widens, left)
+
+
+def test_no_law_of_a_negative_size_is_named():
+    """What explains most is named among the laws that a robot can have."""
+    joints = {"a": JointFit(1e-9, 1e-3)}
+    negative = alternative("box friction", -2.5, 0.1, 0.1, widens=True)
+    beyond = alternative("transeth friction", 3.0, 0.1, 0.2, widens=True)
+    thin = alternative("play at a", -0.01, 0.0001, 0.3, widens=False)
+    play = alternative("play at b", 0.01, 0.001, 0.7, widens=False)
+    law = alternative("box friction", 0.7, 0.2, 0.8, widens=True)
+    unsure = alternative("transeth friction", 1.0, 0.6, 0.5, widens=True)
+
+    def named(*others):
+        explanation = LackOfFit(joints, None, others, (1.0,)).explanation
+        return explanation and explanation.label
+
+    assert named(negative, beyond, thin) is None
+    assert named(negative, beyond, thin, play) == "play at b"
+    assert named(law, unsure, thin) == "box friction"
+    assert named(law, play) == "play at b"
+    assert LackOfFit(joints, None, (negative,), (1.0,)).p < 1e-8  # it still shows a misfit
+
+
+def test_sessions_that_ask_for_other_parameters_are_found():
+    """Three sessions of one series, whose parameter differs in the second."""
+    random = np.random.default_rng(8)
+    column = (0.02 * np.sin(OMEGA * T))[:, None]
+    for change, most in ((0.0, 1.0), (0.3, 1e-3)):
+        truth = np.array([0.0, change, 0.0]) - change / 3
+        rest = [column @ np.array([x]) + SIGMA * random.standard_normal(T.size) for x in truth]
+        problem = LeastSquares([column] * 3, rest, deviations(rest), np.full(1, 4.0))
+        found = halves(problem, np.zeros(1), [0, 1, 2])
+        assert (found.p < 1e-3, found.p <= most) == (change > 0, True)
+        assert found.by_session or not change
+
+
 def test_joints_without_enough_cycles_are_tested_for_memory():
     rest = SIGMA * np.random.default_rng(7).standard_normal(200)
     measured = Measured(("a",), (T[:200],), (rest,))
-    assert lack_of_fit(measured, [rest], OMEGA, None).joints["a"].periodic_rad is None
-    assert lack_of_fit(measured, [rest], 4 * OMEGA, None).joints["a"].periodic_rad is not None
+    assert lack_of_fit(measured, [rest], [OMEGA], None).joints["a"].periodic_rad is None
+    assert lack_of_fit(measured, [rest], [4 * OMEGA], None).joints["a"].periodic_rad is not None
 
 
 ONLY = ("stall_torque", "coulomb_friction", "mu_tangential", "mu_normal")
