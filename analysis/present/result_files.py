@@ -385,7 +385,7 @@ def _of_analysis(result: Analysis) -> Pictures:
     from .segments import body_motion, segments
 
     body = {} if result.body is None else {"body": partial(body_motion, result.body)}
-    return {"segments": partial(segments, result.joints), **body}
+    return {"segments": partial(segments, result.joints, tracking=result.tracking), **body}
 
 
 def _of_experiment(result: Experiment) -> Pictures:

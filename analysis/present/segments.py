@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
@@ -15,6 +16,7 @@ from ..results.analysis import JointResult
 from ..results.body import BodyPoint, BodyResult
 from ..results.estimate import Estimate
 from ..results.formats import degrees, estimate, number, scaled, short
+from ..results.frequency_response import JointTracking
 from .page_tables import is_driven
 from .svg import (
     ABOVE,
@@ -41,32 +43,70 @@ _HOLLOW: dict[str, Any] = {"markersize": 5.2, "markeredgewidth": 1.2, "markerfac
 _PLANES = ("horizontal", "vertical", None)
 
 
-def segments(joints: Sequence[JointResult], prefix: str) -> Drawing:
+@dataclass(frozen=True)
+class _Shown:
+    """What a panel of gains or lags shows.
+
+    Attributes:
+        unit: As text behind a number.
+        of: Value of a joint in this unit.
+        circular: Whether whole turns are alike.
+        least: Span of the panel.
+    """
+
+    unit: str
+    of: Callable[[JointResult], Estimate]
+    circular: bool
+    least: float
+
+
+_ANGLES = _Shown("°", lambda joint: degrees(joint.lag_rad), circular=True, least=1.0)
+
+
+def segments(
+    joints: Sequence[JointResult], prefix: str, tracking: Sequence[JointTracking] = ()
+) -> Drawing:
     """Draw gain, lag and energy of every joint, head to tail, in three panels on one axis.
 
-    Joints without a command are in the energy panel only, with hollow markers.
+    Joints without a command are in the energy panel only, with hollow markers. Where no joint has a
+    gait, gain and lag are those of any motion, the lag in ms.
 
     Args:
         joints: In chain order, at least one.
         prefix: For identifiers, unique in the page.
+        tracking: How joints follow commands that are no gait.
     """
+    lags = _ANGLES
+    if tracking and all(joint.gain.value is None for joint in joints):
+        by_name = {joint.joint: joint for joint in tracking}
+        delays = {name: scaled(joint.lag_s, 1e3) for name, joint in by_name.items()}
+        lags = _Shown(" ms", lambda joint: delays.get(joint.name, Estimate()), False, 1.0)
+        joints = [
+            replace(joint, gain=by_name[joint.name].gain) if joint.name in by_name else joint
+            for joint in joints
+        ]
+    return _drawn(joints, prefix, lags)
+
+
+def _drawn(joints: Sequence[JointResult], prefix: str, lags: _Shown) -> Drawing:
     colors = joint_hex(len(joints))
     tooltips: dict[str, str] = {}
     with drawing(5.8) as figure:
         gain_axes, lag_axes, energy_axes = figure.subplots(3, 1, sharex=True)
-        _estimates(gain_axes, joints, colors, tooltips, what="gain", of=lambda j: j.gain)
-        _estimates(lag_axes, joints, colors, tooltips, what="lag", of=lambda j: degrees(j.lag_rad))
+        gains = _Shown("", lambda joint: joint.gain, circular=False, least=0.02)
+        _estimates(gain_axes, joints, colors, tooltips, what="gain", shown=gains)
+        _estimates(lag_axes, joints, colors, tooltips, what="lag", shown=lags)
         _energies(energy_axes, joints, colors, tooltips)
         gain_axes.set_ylabel("gain [1]")
-        lag_axes.set_ylabel("lag [°]")
+        lag_axes.set_ylabel(f"lag [{lags.unit.strip()}]")
         energy_axes.set_ylabel("energy [J]")
         _flag_marks(gain_axes, joints)
         _segment_axis(energy_axes, len(joints))
         _legend(figure, joints)
         figure.align_ylabels()
         title = "Gain, lag and energy of every joint, head to tail"
-        svg = inline_svg(figure, prefix, title, _in_words(joints), tooltips)
-    return Drawing(svg, _segments_caption(joints))
+        svg = inline_svg(figure, prefix, title, _in_words(joints, lags), tooltips)
+    return Drawing(svg, _segments_caption(joints, lags))
 
 
 def _estimates(
@@ -76,21 +116,20 @@ def _estimates(
     tooltips: dict[str, str],
     *,
     what: str,
-    of: Callable[[JointResult], Estimate],
+    shown: _Shown,
 ) -> None:
     """Draw a panel of values with their intervals, and the mean of each plane, dashed."""
-    lag = what == "lag"
     drawn = False
     for i, joint in enumerate(joints):
-        quantity = of(joint)
+        quantity = shown.of(joint)
         if quantity.value is not None:
             drawn = True
             gid = f"{what}-{i}"
             plot_estimate(axes, i + 1, quantity, colors[i], marker=marker(joint.plane), gid=gid)
-            tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, '°' if lag else '')}")
-    _mean_lines(axes, joints, of, circular=lag)
+            tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, shown.unit)}")
+    _mean_lines(axes, joints, shown.of, circular=shown.circular)
     if drawn:
-        _keep_span(axes, least=1.0 if lag else 0.02)
+        _keep_span(axes, least=shown.least)
     else:
         _empty(axes, f"no {what}: see the warnings")
 
@@ -191,25 +230,26 @@ def _legend(figure: Figure, joints: Sequence[JointResult]) -> None:
         legend(figure, *handles)
 
 
-def _in_words(joints: Sequence[JointResult]) -> str:
+def _in_words(joints: Sequence[JointResult], lags: _Shown) -> str:
     driven = [j for j in joints if j.gain.value is not None]
     if not driven:
         return f"{len(joints)} joints; none has a gain or a lag."
     gains = [j.gain.value for j in driven if j.gain.value is not None]
-    lags = [v for j in driven if (v := degrees(j.lag_rad).value) is not None]
+    values = [v for j in driven if (v := lags.of(j).value) is not None]
     words = (
         f"{len(driven)} of {len(joints)} joints have a gain, {min(gains):.3f} to {max(gains):.3f}"
     )
-    if lags:
-        words += f"; their lag runs from {number(min(lags), 1)} to {number(max(lags), 1)} degrees"
+    if values:
+        unit = " degrees" if lags.circular else lags.unit
+        words += f"; their lag runs from {number(min(values), 1)} to {number(max(values), 1)}{unit}"
     return words + ". The table of joints holds every number."
 
 
-def _segments_caption(joints: Sequence[JointResult]) -> str:
-    text = (
-        "Gain: amplitude of the response over that of the command. Lag: positive is late. "
-        "Bars are 95 % intervals."
-    )
+def _segments_caption(joints: Sequence[JointResult], lags: _Shown) -> str:
+    gain = "amplitude of the response over that of the command"
+    if not lags.circular:
+        gain = "of slow motion, response over command, as the lag; the commands are no gait"
+    text = f"Gain: {gain}. Lag: positive is late. Bars are 95 % intervals."
     if any(j.flags for j in joints):
         text += " An exclamation mark stands over flagged joints; the table gives the reason."
     if any(j.energy_net_j is not None for j in joints):

@@ -303,6 +303,7 @@ def session_view(
     entries = entries_of(analysis.coupling, tuple(j.name for j in joints if is_driven(j)))
     drawn = [(j.gain.value, j.energy_net_j, j.energy_abs_j) for j in joints]
     numbers = any(value is not None for values in drawn for value in values)
+    numbers = numbers or bool(analysis.tracking)
     return {
         "analysis": analysis,
         "answer": answer,
@@ -314,7 +315,9 @@ def session_view(
             for color, joint in zip(colors, joints, strict=True)
         ],
         "trials": session_trials(analysis.heterogeneity),
-        "segments": segments(joints, f"{at}segments-figure") if numbers else None,
+        "segments": segments(joints, f"{at}segments-figure", analysis.tracking)
+        if numbers
+        else None,
         "bode": bode(analysis.frequency_response, f"{at}bode-figure"),
         "signals": command_response(traces, len(joints), f"{at}signals-figure") if traces else None,
         "maps": () if cycles is None else cycle_drawings(cycles, f"{at}map"),

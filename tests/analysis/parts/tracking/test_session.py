@@ -1,5 +1,7 @@
 """Sessions whose commands are no gait: who follows otherwise, in every output."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -78,4 +80,15 @@ def test_every_output_has_gain_lag_and_offset(tmp_path, command):
     assert "lag ms (95 %)" in text
     page = tmp_path / "a.html"
     command("report", path, "-o", page)
-    assert "How each joint follows" in page.read_text()
+    shown = page.read_text()
+    assert "How each joint follows" in shown
+    figure = shown[shown.index('id="segments-figure-title"') :]
+    figure = figure[: figure.index("</svg>")]
+    assert "6 of 6 joints have a gain, 0.8" in figure  # with their intervals, in one figure
+    assert "lag [ms]" in figure
+    assert "no gain" not in figure
+    for number, joint in enumerate(result.tracking):
+        drawn = [float(text) for text in re.findall(rf"j{number}: gain ([0-9.]+)", figure)]
+        assert drawn == [pytest.approx(joint.gain.value, abs=1e-3)]
+        drawn = [float(text) for text in re.findall(rf"j{number}: lag ([0-9.]+)", figure)]
+        assert drawn == [pytest.approx(1e3 * joint.lag_s.value, abs=0.1)]
