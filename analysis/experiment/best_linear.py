@@ -34,8 +34,11 @@ from ..response.nonparametric import LineResponse, line_power, noise_power
 from ..results import formats
 from ..results.estimate import Estimate
 from ..results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
+from .distortion_spread import DistortionSpread, Spread, distortion_spread
 from .multisine_runs import MultisineRun
 from .sweep_runs import MOST_CONDITION
+
+NO_SPREAD, NO_SPREADS = Spread(), DistortionSpread()
 
 IMPURE = 0.01
 """Share of the commands at lines that the plan leaves out from which a warning is given."""
@@ -77,9 +80,12 @@ def best_linear_responses(runs: Sequence[MultisineRun], warn: Warn) -> BestLinea
             realisation_response(inverse, one[:, :, lines])
             for inverse, one in zip(inverses, spectra, strict=True)
         ]
+        spread = _spread(groups, place, lines)
         every = [
             over_realisations(
-                np.stack([value[k] for value, _ in each]), np.stack([noise[k] for _, noise in each])
+                np.stack([value[k] for value, _ in each]),
+                np.stack([noise[k] for _, noise in each]),
+                spread.excited,
             )
             for k in range(len(each[0][0]))
         ]
@@ -90,7 +96,8 @@ def best_linear_responses(runs: Sequence[MultisineRun], warn: Warn) -> BestLinea
             warn(f"{joint}: no line has a response with an interval; it is left out")
             continue
         if periods > 1 and (lines % 2 == 1).all():
-            beside = detection_lines([line_power(y).mean(axis=0) for y in spectra], lines)
+            powers = [line_power(y).mean(axis=0) for y in spectra]
+            beside = detection_lines(powers, lines, spread)
             one = replace(one, odd=beside.odd, even=beside.even)
         found.append(one)
         if orthogonal:
@@ -143,6 +150,14 @@ def _realisations(
                 f"independent commands of {m} joints"
             )
     return found
+
+
+def _spread(
+    groups: Sequence[Sequence[MultisineRun]], place: int, lines: IntArray
+) -> DistortionSpread:
+    """Return the spread of distortion of one joint, by the amplitudes of its command."""
+    sizes = [np.abs(run.command[place]) for group in groups for run in group]
+    return distortion_spread(lines, np.mean(sizes, axis=0), len(groups))
 
 
 def _inverse(group: Sequence[MultisineRun], inputs: Sequence[int]) -> ComplexArray:
@@ -312,12 +327,15 @@ def realisation_response(
     return value, noise
 
 
-def over_realisations(values: ComplexArray, noises: FloatArray) -> BestLinearApproximation:
+def over_realisations(
+    values: ComplexArray, noises: FloatArray, spread: Spread = NO_SPREAD
+) -> BestLinearApproximation:
     """Combine the responses of the realisations.
 
     Args:
         values: Response to one input in each, shape (M, k).
         noises: E|e|^2 of each, made by noise, shape (M, k).
+        spread: Of the distortion in as many realisations.
     """
     realisations = len(values)
     value = values.mean(axis=0)
@@ -338,19 +356,22 @@ def over_realisations(values: ComplexArray, noises: FloatArray) -> BestLinearApp
         noise,
         scatter / realisations,
         excess.mean(axis=0),
-        root_of_mean(excess.sum(axis=1) / power, float(variance) ** 0.5 / power)
+        root_of_mean(excess.sum(axis=1) / power, float(variance) ** 0.5 / power, spread)
         if power > 0
         else Estimate(),
         realisations,
     )
 
 
-def root_of_mean(squares: FloatArray, least_sd: float = 0.0) -> Estimate:
-    """Return the root of a mean square with its interval, by Student's t.
+def root_of_mean(
+    squares: FloatArray, least_sd: float = 0.0, spread: Spread = NO_SPREAD
+) -> Estimate:
+    """Return the root of a mean square with its interval, by Student's t and a known spread.
 
     Args:
         squares: Unbiased estimates of the square, some of which may be below zero, shape (n,).
         least_sd: Least standard deviation of their mean.
+        spread: Of the mean's expectation, which the interval covers at least.
 
     Returns:
         0 where the mean is below zero; empty where some square is NaN; without interval of one.
@@ -362,8 +383,9 @@ def root_of_mean(squares: FloatArray, least_sd: float = 0.0) -> Estimate:
         return Estimate(max(mean, 0.0) ** 0.5)
     reach = float(stdtrit(squares.size - 1, 0.975) * np.std(squares, ddof=1))
     reach = max(reach / squares.size**0.5, 1.96 * least_sd)
-    low, high = (max(end, 0.0) ** 0.5 for end in (mean - reach, mean + reach))
-    return Estimate(max(mean, 0.0) ** 0.5, (low, high))
+    level = max(mean, 0.0)
+    low, high = min(mean - reach, level / spread.high), max(mean + reach, level / spread.low)
+    return Estimate(level**0.5, (max(low, 0.0) ** 0.5, max(high, 0.0) ** 0.5))
 
 
 @dataclass(frozen=True)
@@ -381,24 +403,29 @@ class DetectionLines:
     even: Estimate
 
 
-def detection_lines(powers: Sequence[FloatArray], lines: IntArray) -> DetectionLines:
+def detection_lines(
+    powers: Sequence[FloatArray], lines: IntArray, spread: DistortionSpread = NO_SPREADS
+) -> DetectionLines:
     """Measure what an odd multisine leaves at the lines within its band that it doesn't excite.
 
     Args:
         powers: :func:`line_power` of each realisation, from line 0 on, shape (n,).
         lines: Excited lines, all odd.
+        spread: Of distortion in as many realisations.
 
     Returns:
-        With intervals from the scatter of the realisations; of one from that of the lines.
+        With intervals from the scatter of the realisations, of one from that of the lines, and as
+        wide as the spread at least.
     """
     power = np.stack(powers)
     excited = float(power[:, lines].mean())
     free = np.setdiff1d(np.arange(int(lines[0]), int(lines[-1])), lines)
 
-    def level(parity: int) -> Estimate:
+    def level(parity: int, least: Spread) -> Estimate:
         chosen = power[:, free[free % 2 == parity]]
         if not chosen.size or not excited > 0:
             return Estimate()
-        return root_of_mean((chosen[0] if len(chosen) == 1 else chosen.mean(axis=1)) / excited)
+        squares = (chosen[0] if len(chosen) == 1 else chosen.mean(axis=1)) / excited
+        return root_of_mean(squares, spread=least)
 
-    return DetectionLines(level(1), level(0))
+    return DetectionLines(level(1, spread.odd), level(0, spread.even))
