@@ -23,6 +23,7 @@ from ..common.errors import DataError
 from ..common.strict_table import Faults
 from ..log.messages.frames import EXTENDED_FLAG
 from ..robot.bus_map import Unit, database_messages, unit_for
+from ..robot.description import check_bus
 from ..robot.model import Bus, BusSignal, Quantity, Robot
 
 if TYPE_CHECKING:
@@ -246,11 +247,13 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
 
     Raises:
         DataError: If the robot has no bus, or not the databases that its map needs.
+        RobotFileError: If the map or the databases have faults.
     """
     if robot.bus is None:
         raise DataError(
             f"the robot {robot.name} has no bus map; frames can't be encoded or decoded"
         )
+    check_bus(robot)
     messages = database_messages(dict(robot.databases), Faults()) or {}
     named = {each.message for each in (*robot.bus.signals, *robot.bus.polls)}
     if missing := named - set(messages):

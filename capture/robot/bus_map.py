@@ -164,6 +164,8 @@ def read_bus(
     joints: tuple[Joint, ...],
     sensors: tuple[Sensor, ...],
     read_database: Callable[[str], str | None],
+    *,
+    in_full: bool = True,
 ) -> tuple[Bus, tuple[tuple[str, str], ...]]:
     """Read the bus of a robot; return it with the file name and text of each database.
 
@@ -172,6 +174,7 @@ def read_bus(
         joints: The robot's joints.
         sensors: The robot's sensors.
         read_database: Text of a DBC file by name, None where there is none.
+        in_full: Whether the databases are parsed, and the map is held against them.
     """
     if "family" in table:
         return read_family(table, joints, {name: unit.factor for name, unit in UNITS.items()})
@@ -188,7 +191,7 @@ def read_bus(
         else:
             databases[name] = text
     bitrate: int = read_field(table, Bus, "bitrate")
-    messages = database_messages(databases, table.faults)
+    messages = database_messages(databases, table.faults) if in_full else None
     if len(databases) != len(names):
         messages = None  # what a missing database holds is not a fault of the map
     signals: dict[BusSignal, None] = {}
@@ -215,12 +218,12 @@ def _poll(
         entry.fault("target", listed([*names, _PLACEHOLDER], target))
     message, signals = _message(entry, messages)
     table = entry.table("signals")
-    if signals is None:
-        return BusPoll(message, ())
-    numbers = [(name, table.integer(name, 0)) for name in signals if name in table]
+    lengths = {name: signal.length for name, signal in (signals or {}).items()}
+    names = table.values if signals is None else [name for name in lengths if name in table]
+    numbers = sorted((name, table.integer(name, 0)) for name in names)
     for name, number in numbers:
-        if number >> signals[name].length:
-            table.fault(name, f"a raw number of {signals[name].length} bits")
+        if name in lengths and number >> lengths[name]:
+            table.fault(name, f"a raw number of {lengths[name]} bits")
     table.close()
     return BusPoll(message, tuple(numbers))
 

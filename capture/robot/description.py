@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -242,8 +243,31 @@ def parse_robot(text: str, source: str | Path, databases: Mapping[str, str]) -> 
     return _parse(text, Path(source), databases.get)
 
 
-def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Robot | None:
+def check_bus(robot: Robot) -> None:
+    """Hold the bus map of a robot against its databases.
+
+    A session's description isn't, until frames are decoded: parsing a DBC takes as long as
+    analysing a short session.
+
+    Raises:
+        RobotFileError: If they have faults; lists all of them.
+    """
+    if robot.databases:
+        _check(robot.toml, f"{robot.name}.toml", robot.databases)
+
+
+@lru_cache(maxsize=16)  # every session of a robot carries the same description
+def _check(text: str, source: str, databases: tuple[tuple[str, str], ...]) -> None:
+    parse_robot(text, source, dict(databases))
+
+
+def robot_in_session(
+    attachments: Mapping[str, bytes], source: str | Path, *, in_full: bool = True
+) -> Robot | None:
     """Read the robot description of a session.
+
+    Args:
+        in_full: Whether the databases are parsed; else that is left to :func:`check_bus`.
 
     Returns:
         The robot with its databases and those of its meshes that are there; None if no
@@ -265,7 +289,7 @@ def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Ro
         for name, content in attachments.items()
         if name.endswith(".dbc")
     }
-    robot = _parse(text, source, files.get)
+    robot = _parse(text, source, files.get, in_full=in_full)
     named = dict.fromkeys(link.mesh for link in robot.links if link.mesh in attachments)
     return replace(robot, meshes=tuple((name, attachments[name]) for name in named))
 
@@ -296,6 +320,8 @@ def _parse(
     source: Path,
     read_database: Callable[[str], str | None],
     read_mesh: Callable[[str], bytes | None] | None = None,
+    *,
+    in_full: bool = True,
 ) -> Robot:
     try:
         values = read_toml(text)
@@ -314,7 +340,8 @@ def _parse(
     _note_repeated(faults, "joints and sensors", [part.name for part in (*joints, *sensors)])
     bus, databases = None, ()
     if "bus" in top:
-        bus, databases = read_bus(top.table("bus"), joints, sensors, read_database)
+        table = top.table("bus")
+        bus, databases = read_bus(table, joints, sensors, read_database, in_full=in_full)
     safety = _read_safety(top, joints)
     meshes = () if read_mesh is None else read_meshes(links, faults, read_mesh)
     defaults.close()

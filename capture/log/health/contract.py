@@ -352,7 +352,7 @@ def _robot(log: OpenLog) -> Iterator[Violation]:
         fix = "attach the robot's description, with the DBC files that it lists"
         yield Violation("robot", "attachment robot.toml", f"nothing, for {named!r}", fix)
     before = len(log.warnings)
-    if attached and log.robot is None:
+    if attached and log.checked_robot is None:
         found = "; ".join(log.warnings[before:]) or "a description with faults"
         yield Violation("robot", "attachment robot.toml", found, "correct it: undulog robot check")
     elif log.robot is not None and named and log.robot.name != named:

@@ -196,7 +196,7 @@ class _Check:
             found = self._view.joint_topics(*topics)
             self._view = self._view.with_joints(*topics)
             topics = _recorded(log, found.command), _recorded(log, found.response)
-        self._scan = SessionScan(log.robot, topics=topics)
+        self._scan = SessionScan(log.checked_robot, topics=topics)
         self._notes = log.warnings[len(log.file.warnings) :]
         for key in log.file.channels:
             self._define(key)

@@ -70,7 +70,18 @@ class OpenLog:
 
     @cached_property
     def robot(self) -> Robot | None:
-        """The robot whose description is attached, or was given for a log without one; or None."""
+        """The robot whose description is attached, or was given for a log without one; or None.
+
+        Its bus map isn't held against its databases; see :attr:`checked_robot`.
+        """
+        return self._described(in_full=False)
+
+    @cached_property
+    def checked_robot(self) -> Robot | None:
+        """The same, None where the bus map or its databases have faults, too."""
+        return self._described(in_full=True)
+
+    def _described(self, *, in_full: bool) -> Robot | None:
         if self.robot_given is not None:
             return self.robot_given[1]
         if DESCRIPTION not in self.file.attachments:
@@ -79,7 +90,7 @@ class OpenLog:
 
         attached = {name: item.data for name, item in self.file.attachments.items()}
         try:
-            return robot_in_session(attached, self.path)
+            return robot_in_session(attached, self.path, in_full=in_full)
         except RobotFileError as error:
             self._warn(f"the attached robot description can't be used: {error}")
             return None
