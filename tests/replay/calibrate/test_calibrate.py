@@ -42,6 +42,12 @@ def assert_true_or_open(found, truth):
         assert not one["determined"] or one["value"] == pytest.approx(value, rel=0.03), one
 
 
+def assert_narrow(parameter, within=0.03):
+    """The noise leaves it within this share; the physics step widens the other end."""
+    value, (low, high) = parameter["value"], parameter["ci95"]
+    assert min(value - low, high - value) <= within * value, parameter
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     hidden = "[servo]\nstall_torque = 0.33\ncoulomb_friction = 0.025\n"
@@ -56,7 +62,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
     report, found = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
     assert_true_or_open(found, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025})
-    assert found["stall_torque", None]["determined"]
+    assert_narrow(found["stall_torque", None])
     assert report["converged"]
     assert report["rms_rad"]["after"] == pytest.approx(0.001, rel=0.05)  # the encoders' noise
     assert report["rms_rad"]["before"] > report["rms_rad"]["after"]
@@ -165,7 +171,7 @@ def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, report_of):
     names = ("stall_torque", "proportional_gain", "viscous_friction")
     truth = dict(zip(names, (0.345, 6.8, 0.006), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
-    assert found["stall_torque", None]["determined"]
+    assert_narrow(found["stall_torque", None])
     assert not any("stall torque" in one["factors"] for one in report["ridges"])
 
 
@@ -187,8 +193,8 @@ mu_normal = 0.56
     assert not report["search"]["named"]  # no module differs
     truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
-    assert found["stall_torque", None]["determined"]
-    assert found["proportional_gain", None]["determined"]
+    assert_narrow(found["stall_torque", None])
+    assert_narrow(found["proportional_gain", None])
 
 
 @pytest.mark.nightly
@@ -202,8 +208,8 @@ def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, report_of, command):
     report, found = fitted(tmp_path, report_of, *words, source="arc.mcap")
     assert not any(one["determined"] for one in found.values())
     assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
-    assert report["rms_rad"]["after"] < 0.005  # of a way of 17 rad
-    assert report["residual_memory_samples"] > 3.0  # the twin isn't this servo
+    assert report["rms_rad"]["after"] < 0.002  # of a way of 17 rad; 0.0036 if held by the ticks
+    assert not report["fits"]  # the twin isn't this servo
     assert load_robot(tmp_path / "f.toml").bus is not None  # its DBC files lie beside it
 
 
