@@ -39,6 +39,7 @@ def analyse(
     topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
     excitation_topic: str | None = None,
+    period: float | None = None,
     robot: str | None = None,
     null: Path | None = None,
     each: bool = False,
@@ -73,6 +74,8 @@ def analyse(
         reference_topic: JointState topic of a second sensor of the same positions, to be compared.
         excitation_topic: JointState topic of what the commands follow from outside, where they
             depend on measured motion, too; frequency responses are by the indirect method then.
+        period: Period of a motion without commands whose rhythm wanders [s]; mean cycles, lags and
+            waves are measured at it.
         robot: Description of the robot of a log without one, a name or a TOML file.
         null: Model of identical modules (see `undulog sim null`) to hold the one session to.
         each: Analyse several sessions one by one instead of as one experiment.
@@ -80,7 +83,7 @@ def analyse(
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
-    options = chosen(start, stop, topics, reference_topic, excitation_topic)
+    options = chosen(start, stop, topics, reference_topic, excitation_topic, period=period)
     if any(is_data_set(file) for file in files):
         _check_data_set(files, options, [null, robot, each or None])
         return show_data_set(files[0], output, csv, force=force, as_json=json)
@@ -238,6 +241,8 @@ def chosen(
     topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
     excitation_topic: str | None = None,
+    *,
+    period: float | None = None,
 ) -> Options:
     """Check and collect the options of the analysis of each session.
 
@@ -246,17 +251,20 @@ def chosen(
         stop: From the session's start [s].
         reference_topic: Of a second sensor.
         excitation_topic: Of what the commands follow from outside.
+        period: Of a motion without commands [s].
 
     Raises:
-        UsageError: If the window is empty.
+        UsageError: If the window is empty, or the period isn't positive.
     """
     if start is not None and not start >= 0:
         raise UsageError(f"--start {start:g} is before the session's start, which is 0")
     if stop is not None and not stop > (start or 0.0):
         raise UsageError(f"--stop {stop:g} is not after --start {start or 0.0:g}")
+    if period is not None and not 0 < period < float("inf"):
+        raise UsageError(f"--period {period:g} is no period in seconds, e.g. --period 0.5")
     from ..signals.stretch import Options
 
-    return Options(start, stop, *topics.names, reference_topic, excitation_topic)
+    return Options(start, stop, *topics.names, reference_topic, excitation_topic, period)
 
 
 def opened(

@@ -38,6 +38,7 @@ def report(
     start: float | None = None,
     stop: float | None = None,
     topics: JointTopicOptions = CONTRACT,
+    period: float | None = None,
     robot: str | None = None,
     plots: Path | None = None,
     format_: Annotated[_Format, Parameter(name="--format")] = "svg",
@@ -82,6 +83,8 @@ def report(
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
         topics: Where commands and responses are.
+        period: Period of a motion without commands whose rhythm wanders [s], as for `undulog
+            analyse`.
         robot: Description of the robot of a log without one, a name or a TOML file.
         plots: Write each figure of the page to a file in this folder; of several pages, in a folder
             of the page's name in it.
@@ -90,7 +93,7 @@ def report(
         json: Print one JSON object: the page, the answer, and the answer to each session; of a
             folder of pages a list of them.
     """
-    options = chosen(start, stop, topics)
+    options = chosen(start, stop, topics, period=period)
     _check_sources(files, catalog, find, options)
     paths = sessions_of(files)
     several = len(paths) > 1

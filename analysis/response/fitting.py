@@ -403,6 +403,39 @@ def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:
     return GaitFit(fit, variance**0.5, dof, (), (), None, {})
 
 
+def fit_at_period(
+    responses: Mapping[str, Series], period_s: float, duration_s: float, warn: Warn
+) -> GaitFit | None:
+    """Fit a motion without commands at a period that the user states, however it wanders.
+
+    Args:
+        responses: By joint name, in chain order.
+        duration_s: Length of the window [s].
+        warn: Receives what the period explains.
+
+    Returns:
+        The fit; None, with a warning, where the window is too short or sampled too seldom for it.
+    """
+    omega = 2 * np.pi / period_s
+    moving = [one for one in responses.values() if _usable(one, omega) and np.ptp(one.values) > 0]
+    if not moving or duration_s < MIN_CYCLES * period_s:
+        warn(
+            Lacking(
+                f"no gait: no joint moves for {MIN_CYCLES:g} cycles of the stated period of "
+                f"{period_s:g} s, with {1 / NYQUIST_SHARE:.2g} samples a cycle"
+            )
+        )
+        return None
+    fit = fit_at(moving, omega, allowed_model(moving, omega))
+    _, dof = omega_variance(fit, residual_noise(moving, fit))
+    share = f"{100 * max(1 - float(fit.rss.sum() / fit.total.sum()), 0.0):.0f} %"
+    warn(
+        f"the period of {period_s:g} s is stated, not found: mean cycles at it explain {share} of "
+        "the motion's variance; amplitudes are smaller than those of single cycles where it wanders"
+    )
+    return GaitFit(fit, 0.0, dof, (), (), None, {})
+
+
 def _usable(one: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
     """Enough samples, often enough, for long enough."""
     if one.count <= least:

@@ -25,7 +25,7 @@ from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import closed_loop, session_couplings
 from ..parts.tracking.gait import gait_offsets
 from ..parts.tracking.measure import Tracked, track_joints
-from ..response.fitting import GaitFit, fit_gait
+from ..response.fitting import GaitFit, fit_at_period, fit_gait
 from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, JointResult, SessionFacts
@@ -163,7 +163,7 @@ def measure_session(
     session.forget()
     false = [one.joint for one in held if one.falsifies("position")]
     sound = {name: one for name, one in responses.items() if name not in false}
-    gait = fit_gait(commands, sound, stretch.duration_s, warn)
+    gait = _gait(commands, sound, stretch.duration_s, options.period_s, warn)
     span = _span(stretch, origin_ns, gait)
     faulty = not_following(follows)
     # Plateaus of stopped joints are no dead bands.
@@ -288,6 +288,21 @@ def _read(session: SessionView, options: Options, warn: Warn) -> tuple[Columns, 
         command_topic=columns.topics.get("command", options.command_topic),
         response_topic=columns.topics.get("position", options.response_topic),
     )
+
+
+def _gait(
+    commands: Mapping[str, Series],
+    sound: Mapping[str, Series],
+    duration_s: float,
+    period_s: float | None,
+    warn: Warn,
+) -> GaitFit | None:
+    """Fit the gait; a motion without commands at the period that the user states, if any."""
+    if period_s is None or commands:
+        if period_s is not None:
+            warn(Note("--period is of motions without commands: the commands have their own"))
+        return fit_gait(commands, sound, duration_s, warn)
+    return fit_at_period(sound, period_s, duration_s, warn)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ class Options:
         response_topic: Topic of the responses, likewise.
         reference_topic: JointState topic of a second sensor of the same positions, or None.
         excitation_topic: JointState topic of what the commands follow from outside, or None.
+        period_s: Period of a motion without commands [s]; None: found.
     """
 
     start_s: float | None = None
@@ -49,6 +50,7 @@ class Options:
     response_topic: str = RESPONSE_TOPIC
     reference_topic: str | None = None
     excitation_topic: str | None = None
+    period_s: float | None = None
 
     def arguments(self) -> list[str]:
         """Return the command-line arguments for these options, without defaults."""
@@ -198,13 +200,15 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
             )
         )
         later = chosen
+    stated = settle_s > 0 or GAIT_TOPIC in session.channels
+    if not columns.command and not stated and options.start_s is None:
+        return Choice(_after_soft_start(columns, later, warn))
     series = _swinging(columns, later)
     span = moving(series)
     if span is None:
         return Choice(later)
     if GAIT_TOPIC not in session.channels and (gaits := _constant(series, span, later)):
         return Choice.longest(gaits, warn)
-    stated = settle_s > 0 or GAIT_TOPIC in session.channels
     return Choice(_in_motion(series, span, later, options, warn, stated=stated))
 
 
@@ -341,6 +345,22 @@ def _in_motion(
     # Moving to the last sample: that sample's own interval belongs to it.
     ends = stretch.stop_ns - stop <= 2 * round(period * NS)
     return stretch.intersect(start, None if ends else stop)
+
+
+def _after_soft_start(columns: Columns, stretch: Stretch, warn: Warn) -> Stretch:
+    """Without a soft start of a motion whose commands were not logged."""
+    series = [
+        clean(name, signal.t_ns, signal.values, stretch.start_ns).between(0.0, stretch.duration_s)
+        for name, signal in columns.position.items()
+    ]
+    start_s, _ = steady_part(series, 0.0, stretch.duration_s)
+    if start_s <= 0:
+        return stretch
+    warn(
+        f"soft start: {start_s:.1f} s before the motion has its steady amplitude are left out "
+        "(choose with --start)"
+    )
+    return stretch.intersect(stretch.start_ns + round(start_s * NS), None)
 
 
 def _warn_soft(motion: tuple[float, float], steady: tuple[float, float], warn: Warn) -> None:
