@@ -3,9 +3,10 @@
 Ordinary work shows a gain or a lag only where it moves, so that few blocks of time know either
 (:mod:`.shifts` needs eight). The residual of a joint's response is regressed over the whole record,
 
-    r(t) = b0 + b1 p(t) - b2 p'(t) + c z(t) [t >= t0] + e(t),                                  (1)
+    r(t) = b0 + b1 p(t) - b2 p'(t) + d [t >= t0] + c z(t) [t >= t0] + e(t),                    (1)
 
-on one, on the response p and on its rate p', with a change c of one of the three, z, at t0 (Chow,
+on one, on the response p and on its rate p', with a change c of one of the three, z, at t0, and of
+a gain or a lag beside a change d of the offset: of two postures these are the same (Chow,
 Econometrica 28, 1960, doi 10.2307/1910133; t0 by search: Andrews, Econometrica 61, 1993, doi
 10.2307/2951764). The error of c is that of sums over blocks of time, each as large as what (1)
 leaves in it (Liang & Zeger, Biometrika 73, 1986, doi 10.1093/biomet/73.1.13), with Student's
@@ -31,6 +32,7 @@ from .levels import (
     ENOUGH_LIKE,
     FEWEST,
     GAIN_MARGIN,
+    HALF,
     LARGEST_REST_RAD,
     LEVEL,
     QUARTER,
@@ -51,7 +53,7 @@ class Breaks:
         before: b0, b1 or b2, the coefficient until then.
         error: Standard error of c.
         freedom: Degrees of freedom of the error; below 1 where too little is known.
-        drop: Of the sum of squares.
+        drop: Of the sum of squares, of gain and lag beside that of a change of the offset.
         left: Sum of squares that is left.
     """
 
@@ -98,6 +100,8 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[t
         size, half = float(change[q, cut]), float(error[q, cut])
         if not _matters(int(q), size, half, moments[k]):
             continue
+        if _rests_on_one_block(int(q), int(cut), moments[k]):
+            continue
         if QUANTITIES[q] == "gain":  # relative to before, when the joint responded at all
             before = max(1 + float(own.before[q, cut]), QUARTER)
             size, half = size / before, half / before
@@ -135,6 +139,37 @@ def _matters(q: int, change: float, error: float, moments: FloatArray) -> bool:
     return reaches(abs(change), WIDTH * error, margin)
 
 
+def _rests_on_one_block(q: int, cut: int, moments: FloatArray) -> bool:
+    """Return whether a change is another, or hardly known, without one of the blocks.
+
+    Where steps are the only motion, a sample or two between a command and its response decide what
+    is a change and what isn't, and they agree with themselves.
+    """
+    terms = [*range(TERMS), *sorted({0, q}), TERMS]
+    behind = np.arange(len(moments)) > cut
+    later = np.arange(len(terms)) >= TERMS
+    later[-1] = False
+    kept = np.where(behind[:, None, None] | ~(later[:, None] | later[None, :]), 1.0, 0.0)
+    parts = moments[:, terms][:, :, terms] * kept
+    total = parts.sum(axis=0)
+    change, power = _last_of(total[None])
+    changes, powers = _last_of(total - parts)
+    return bool(np.any(powers < QUARTER * power) or np.any(changes / change < HALF))
+
+
+def _last_of(products: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the last coefficient of least squares, and the power of what only it explains.
+
+    Args:
+        products: Of the columns with each other, the target last, shape (b, p + 1, p + 1).
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), TINY))[:, :-1]
+    gram = products[:, :-1, :-1] / (scale[:, :, None] * scale[:, None, :])
+    inverse = np.linalg.inv(gram + EPS * np.eye(scale.shape[1]))
+    solved = np.einsum("bij,bj->bi", inverse, products[:, :-1, -1] / scale) / scale
+    return solved[:, -1], scale[:, -1] ** 2 / inverse[:, -1, -1]
+
+
 def breaks_of(moments: FloatArray) -> Breaks:
     """Regress equation (1) for a change at each border of two blocks.
 
@@ -152,7 +187,8 @@ def breaks_of(moments: FloatArray) -> Breaks:
     most = float(total[TERMS, TERMS] - common @ target)
     each = [_change_of(q, moments, after, inverse, common) for q in range(TERMS)]
     change, before, error, freedom, drop = (np.stack(rows) for rows in zip(*each, strict=True))
-    return Breaks(change, before, error, freedom, drop, np.maximum(most - drop, 0.0))
+    explained = drop + drop[0] * (np.arange(TERMS) > 0)[:, None]
+    return Breaks(change, before, error, freedom, drop, np.maximum(most - explained, 0.0))
 
 
 def _change_of(
@@ -160,25 +196,62 @@ def _change_of(
 ) -> tuple[FloatArray, ...]:
     """Return change, coefficient before, error, freedom and drop of one term, each (b - 1,)."""
     gram, target = moments[:, :TERMS, :TERMS], moments[:, :TERMS, TERMS]
-    along = after[:, :TERMS, q] @ inverse  # what the common terms make of z [t >= t0], (cut, 3)
-    free = after[:, q, q] - np.einsum("ci,ci->c", along, after[:, :TERMS, q])
+    behind = np.arange(len(moments)) >= np.arange(1, len(moments))[:, None]  # (cut, block)
+    # Free parts of 1 [t >= t0] and of z [t >= t0], as factors of the terms from t0 on and always.
+    step, change = (_Free.of(term, after, inverse) for term in (0, q))
+    if q > 0:  # a joint that rests elsewhere from t0 on has neither another gain nor another lag
+        change = change.beside(step, gram, behind)
+    part = change.parts(behind)
+    free: FloatArray = np.einsum("cbi,bij,cbj->c", part, gram, part)
     known = free > np.sqrt(EPS) * float(moments[:, q, q].sum())
     free = np.where(known, free, 1.0)
-    change = np.where(known, (after[:, q, TERMS] - after[:, :TERMS, q] @ common) / free, 0.0)
-    terms = common - change[:, None] * along
-    behind = np.arange(len(moments)) >= np.arange(1, len(moments))[:, None]  # (cut, block)
+    size = np.where(known, np.einsum("cbi,bi->c", part, target) / free, 0.0)
     # Of each block: the sum of the free part of z [t >= t0] times what (1) leaves, and its power.
-    part = behind[:, :, None] * np.eye(TERMS)[q] - along[:, None, :]
-    left = target - np.einsum("bij,cj->cbi", gram, terms)
-    left -= (change[:, None] * behind)[:, :, None] * gram[:, :, q]
-    scores = np.einsum("cbi,cbi->cb", part, left)
+    terms: FloatArray = np.broadcast_to(common, part.shape) + size[:, None, None] * part
+    if q > 0:
+        parts = step.parts(behind)
+        power = np.einsum("cbi,bij,cbj->c", parts, gram, parts)
+        offset = np.einsum("cbi,bi->c", parts, target) / np.maximum(power, TINY)
+        terms = terms + offset[:, None, None] * parts
+    scores = np.einsum("cbi,cbi->cb", part, target - np.einsum("bij,cbj->cbi", gram, terms))
     power = np.einsum("cbi,bij,cbj->cb", part, gram, part)
     blocks = free**2 / np.maximum(np.sum(power**2, axis=1), TINY)
     freedom = np.where(known, blocks - 2, 0.0)  # a mean before and one after
     squares = np.maximum(np.sum(scores**2, axis=1), TINY)
     rho = np.clip(np.sum(scores[:, 1:] * scores[:, :-1], axis=1) / squares, 0, COVERAGE)
     squares *= (1 + rho) / (1 - rho) * blocks / np.maximum(freedom, 1)
-    return change, terms[:, q], np.sqrt(squares) / free, freedom, change**2 * free
+    return size, terms[:, 0, q], np.sqrt(squares) / free, freedom, size**2 * free
+
+
+@dataclass(frozen=True)
+class _Free:
+    """What other terms don't make of a term from t0 on, for b - 1 times t0.
+
+    Attributes:
+        always: Factors of one, p and -p' in it, shape (b - 1, 3).
+        later: Factors of the same from t0 on, shape (b - 1, 3).
+    """
+
+    always: FloatArray
+    later: FloatArray
+
+    @classmethod
+    def of(cls, term: int, after: FloatArray, inverse: FloatArray) -> _Free:
+        """Take off what one, p and -p' make of it."""
+        always = -after[:, :TERMS, term] @ inverse
+        return cls(always, np.tile(np.eye(TERMS)[term], (len(always), 1)))
+
+    def parts(self, behind: BoolArray) -> FloatArray:
+        """Return the factors of one, p and -p' in each block, shape (b - 1, b, 3)."""
+        return self.always[:, None] + behind[:, :, None] * self.later[:, None]
+
+    def beside(self, other: _Free, gram: FloatArray, behind: BoolArray) -> _Free:
+        """Take off what another makes of it, too."""
+        mine, others = self.parts(behind), other.parts(behind)
+        both = np.einsum("cbi,bij,cbj->c", mine, gram, others)
+        power = np.einsum("cbi,bij,cbj->c", others, gram, others)
+        share = (both / np.maximum(power, TINY))[:, None]
+        return _Free(self.always - share * other.always, self.later - share * other.later)
 
 
 def _limit(freedom: FloatArray, tests: int) -> FloatArray:

@@ -21,16 +21,22 @@ def moments(rows):
     return moments_of(rows, rows, WIDTH * np.arange(BLOCKS), WIDTH)
 
 
+def design(rows, q, cut):
+    """Return the terms, of gain and lag a change of the offset, and the change, as columns."""
+    behind = np.arange(rows.shape[1]) >= (cut + 1) * WIDTH
+    steps = [np.where(behind, rows[term], 0.0) for term in sorted({0, q})]
+    return np.stack([*rows[:TERMS], *steps], axis=1)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_break_is_that_of_least_squares_with_a_column_of_its_own(seed):
     rows = columns(np.random.default_rng(seed))
     found = breaks_of(moments(rows))
     for q in range(TERMS):
         for cut in range(BLOCKS - 1):
-            own = np.where(np.arange(rows.shape[1]) >= (cut + 1) * WIDTH, rows[q], 0.0)
-            x = np.stack([*rows[:TERMS], own], axis=1)
+            x = design(rows, q, cut)
             fitted, squares, *_ = np.linalg.lstsq(x, rows[TERMS], rcond=None)
-            without = np.linalg.lstsq(x[:, :TERMS], rows[TERMS], rcond=None)[1]
+            without = np.linalg.lstsq(x[:, :-1], rows[TERMS], rcond=None)[1]
             assert found.change[q, cut] == pytest.approx(fitted[-1], rel=1e-6, abs=1e-9)
             assert found.before[q, cut] == pytest.approx(fitted[q], rel=1e-6, abs=1e-9)
             assert found.left[q, cut] == pytest.approx(squares[0], rel=1e-9)
@@ -41,10 +47,9 @@ def test_the_error_of_a_break_is_that_of_sums_over_blocks():
     rows = columns(np.random.default_rng(7))
     found = breaks_of(moments(rows))
     q, cut = 1, 5
-    own = np.where(np.arange(rows.shape[1]) >= (cut + 1) * WIDTH, rows[q], 0.0)
-    x = np.stack([*rows[:TERMS], own], axis=1)
+    x = design(rows, q, cut)
     left = rows[TERMS] - x @ np.linalg.lstsq(x, rows[TERMS], rcond=None)[0]
-    free = own - x[:, :TERMS] @ np.linalg.lstsq(x[:, :TERMS], own, rcond=None)[0]
+    free = x[:, -1] - x[:, :-1] @ np.linalg.lstsq(x[:, :-1], x[:, -1], rcond=None)[0]
     scores, power = ((free * part).reshape(BLOCKS, WIDTH).sum(axis=1) for part in (left, free))
     blocks = power.sum() ** 2 / (power**2).sum()
     assert found.freedom[q, cut] == pytest.approx(blocks - 2)
