@@ -37,6 +37,9 @@ class Deviations:
         power: Variance of the states.
         asked: Variance of x.
         count: Frames that are used.
+        gain_error: Standard error of the gain by the episode's own residual, where it was searched;
+            else 0.
+        lag_error: The same of the lag [frames].
     """
 
     gain: FloatArray
@@ -49,6 +52,8 @@ class Deviations:
     power: FloatArray
     asked: FloatArray
     count: FloatArray
+    gain_error: FloatArray
+    lag_error: FloatArray
 
     @classmethod
     def empty(cls, episodes: int, joints: int) -> Deviations:
@@ -87,8 +92,12 @@ class Regression:
     residual: FloatArray
 
 
-def regress(block: Block, response: Response) -> Regression:
-    """Fit gain, level and lag of a block's episodes."""
+def regress(block: Block, response: Response, frames: int = 0) -> Regression:
+    """Fit gain, level and lag of a block's episodes.
+
+    Args:
+        frames: Of a block of time, where errors by each episode's own residual are asked for.
+    """
     weights = block.inside.astype(np.float64)
     weights[: min(response.settled, len(weights) // 4)] = 0.0
     count = np.maximum(weights.sum(axis=0), 1.0)[:, None]
@@ -101,6 +110,12 @@ def regress(block: Block, response: Response) -> Regression:
     step = (dy - dx * xy / xx) / free
     gain = (xy - step * dx) / xx
     residual = y - gain * x - step * late
+    gain_error, lag_error = np.zeros_like(gain), np.zeros_like(gain)
+    if frames > 0:
+        along = x - late * (dx / np.maximum(dd, TINY))
+        gain_error = _own_error(residual * along, dot(along, along), frames)
+        across = late - x * (dx / xx)
+        lag_error = _own_error(residual * across, free, frames) / np.maximum(np.abs(gain), TINY)
     deviations = Deviations(
         gain=gain,
         middle=np.einsum("tk,tkm->km", weights, raw) / count,
@@ -112,8 +127,21 @@ def regress(block: Block, response: Response) -> Regression:
         power=dot(y, y) / count,
         asked=xx / count,
         count=np.broadcast_to(count, gain.shape),
+        gain_error=gain_error,
+        lag_error=lag_error,
     )
     return Regression(deviations, weights, raw, (x, late), residual)
+
+
+def _own_error(scores: FloatArray, power: FloatArray, frames: int) -> FloatArray:
+    """Return a standard error by sums over blocks of time, shape (k, m).
+
+    Args:
+        scores: The free part of a column times the residual, shape (t, k, m).
+        power: Of the free part, shape (k, m).
+    """
+    sums = np.add.reduceat(scores, np.arange(0, len(scores), frames), axis=0)
+    return np.sqrt(dot(sums, sums)) / np.maximum(power, TINY)
 
 
 def inflation_of(regression: Regression, fps: float) -> FloatArray:
@@ -130,16 +158,20 @@ def inflation_of(regression: Regression, fps: float) -> FloatArray:
     return np.maximum(np.stack(ratios), 1.0)
 
 
-def searched(block: Block, response: Response, most: int) -> Deviations:
+def searched(block: Block, response: Response, most: int, fps: float) -> Deviations:
     """Search the lags of a block's episodes frame by frame, and return what fits best.
+
+    A joint at its largest speed is later in some motions than in others: the errors are those of
+    each episode's own residual.
 
     Args:
         most: Frames on either side of the common delay.
     """
-    best = regress(block, response).deviations
+    frames = max(round(BLOCK_S * fps), 1)
+    best = regress(block, response, frames).deviations
     for shift in range(-most, most + 1):
         moved = Response(response.delay + shift, response.constant, response.play)
-        tried = regress(block, moved).deviations
+        tried = regress(block, moved, frames).deviations
         tried = replace(tried, lag=tried.lag + shift)
         forward = tried.gain > 0
         better = forward & ((tried.left < best.left) | (best.gain <= 0))

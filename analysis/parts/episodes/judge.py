@@ -144,8 +144,8 @@ def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, Floa
         "offset": d.mean - usual * d.middle,
     }
     errors = {
-        "gain": d.gain_unit * noise[1] / np.abs(usual),
-        "lag": d.lag_unit * noise[2] / np.abs(usual),
+        "gain": np.maximum(d.gain_unit * noise[1], d.gain_error) / np.abs(usual),
+        "lag": np.maximum(d.lag_unit * noise[2] / np.abs(usual), d.lag_error),
         "offset": noise[0] / np.sqrt(d.count),
     }
     return values, errors
@@ -164,7 +164,9 @@ def _search_again(measured: Measured) -> None:
         for first in range(0, again.size, TOGETHER):
             indices = again[first : first + TOGETHER]
             block = block_of(measured.record, measured.used[indices])
-            measured.deviations.put(indices, searched(block, measured.response, most))
+            measured.deviations.put(
+                indices, searched(block, measured.response, most, measured.record.fps)
+            )
 
 
 class _Judge:
