@@ -120,7 +120,10 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
     runs = [*a, *b]
     for run in runs:
         if not run.names:
-            raise DataError(f"{run.label} has no gait, so there is no gait phase to align it by")
+            raise DataError(
+                f"{run.label} has no gait, so there is no gait phase to align it by, and others "
+                "have one: compare sessions with a gait, or sessions without"
+            )
     for side, own in (("A", a), ("B", b)):
         _refuse_copies([(run.label, run.ratio) for run in own], side)
     joints = list(dict.fromkeys(name for run in runs for name in run.names))

@@ -134,8 +134,9 @@ def _equivalence(comparison: Comparison) -> str:
 def comparison_method(comparison: Comparison) -> str:
     """Return the method of a comparison as one sentence, beginning in lower case."""
     phase = "gait phase" if comparison.commanded else "the phase of the first joint's own motion"
+    aligned = f"aligned by {phase}" if comparison.waveforms else "each joint against its command"
     return (
-        f"aligned by {phase}; {_DESIGNS[comparison.design]}; decisions over all "
+        f"{aligned}; {_DESIGNS[comparison.design]}; decisions over all "
         f"{len(comparison.differences)} quantities after Holm at "
         f"{100 * SIGNIFICANT_DIFFERENCE:g} %, "
         "intervals hold together at 95 % after Bonferroni; the same within margins: two one-sided "
