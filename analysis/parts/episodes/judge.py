@@ -152,7 +152,7 @@ def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, Floa
 
 
 def _search_again(measured: Measured) -> None:
-    """Search the lags of the episodes in which a joint may be off further than a line tells."""
+    """Search the lags of episodes in which a joint may be off too far for a linear estimate."""
     values, errors = values_of(measured)
     left = np.log(measured.deviations.left + TINY)
     likely = outliers_of(left, np.zeros_like(left), WORSE, LIKELY).outside
