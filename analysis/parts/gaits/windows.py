@@ -94,7 +94,9 @@ class Repeats:
         return (self.stop_s - self.start_s) / self.period_s
 
     def settled(self) -> Repeats:
-        """The window without its first period."""
+        """The window without its first period, where enough are left."""
+        if self.cycles < MIN_CYCLES + 1 - _SLACK:
+            return self
         return replace(self, start_s=self.start_s + self.period_s)
 
 
@@ -108,8 +110,8 @@ def several_gaits(commands: Sequence[Series], start_s: float, stop_s: float) -> 
 
     Returns:
         Windows of at least ``MIN_CYCLES`` periods in order of time, without the first period after
-        a change, in which the joints settle. None where there is one gait, or where what repeats
-        itself is less than ``MIN_EXPLAINED`` of the time in motion.
+        a change, in which the joints settle, where so many are left. None where there is one gait,
+        or where what repeats itself is less than ``MIN_EXPLAINED`` of the time in motion.
     """
     grid = _Grid.of(commands, start_s, stop_s)
     windows = [] if grid is None else _constant(grid)
@@ -118,8 +120,7 @@ def several_gaits(commands: Sequence[Series], start_s: float, stop_s: float) -> 
     longest_s = max(window.period_s for window in windows)
     if _covered(windows) < MIN_EXPLAINED * grid.moving_s(longest_s):
         return []
-    settled = [windows[0], *(window.settled() for window in windows[1:])]
-    return [window for window in settled if window.cycles >= MIN_CYCLES - _SLACK]
+    return [windows[0], *(window.settled() for window in windows[1:])]
 
 
 def _constant(grid: _Grid) -> list[Repeats]:

@@ -49,6 +49,15 @@ def test_the_same_gait_in_other_units_and_at_another_time_has_the_same_windows()
         assert b.stop_s - 1000.0 == pytest.approx(a.stop_s, abs=0.03)
 
 
+@pytest.mark.parametrize("cycles", [3.4, 3.7, 4.5, 6.0])
+def test_a_short_gait_after_a_long_one_is_kept(cycles):
+    series, stop_s = commands(by_time([0.5, 0.8], [30.0, cycles / 0.8]))
+    windows = several_gaits(series, 0.0, stop_s)
+    assert len(windows) == 2
+    assert windows[1].cycles >= 2.75
+    assert windows[1].stop_s == pytest.approx(stop_s, abs=0.3)
+
+
 def test_a_pause_divides_one_gait():
     amplitude = by_time([1.0, 0.0, 1.0], [20.0, 10.0, 20.0])
     series, stop_s = commands(np.full(amplitude.size, 0.6), amplitude=amplitude)
