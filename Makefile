@@ -132,7 +132,7 @@ bench: $(READY)  ## speed, as ratios against named peers, onto one page (QUICK=1
 	$(BIN)/python bench/all.py $(if $(QUICK),--quick)
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
-	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W -q -E -b html docs docs/_build/html
 
 schemas: $(READY)  ## the JSON Schemas of the results, which ship with the package
 	$(BIN)/python docs/reference_pages.py
