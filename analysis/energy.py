@@ -31,8 +31,8 @@ from .body.travel import GRAVITY, body_steps
 from .estimators.demodulation import Weighed, cycle_sums, weigh
 from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean
-from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport
 from .results.answer import Artefact, Note
+from .results.cycles import Closure, Each, EnergyResult, JointCycles, Transport
 from .results.estimate import Estimate
 from .signals.columns import Columns
 from .signals.windows import Span

@@ -19,6 +19,7 @@ from undulog.analysis.results import analysis, answer, oscillators
 from undulog.analysis.results.analysis import Analysis, interval_key
 from undulog.analysis.results.body import BodyPoint, BodyTravel, LinkContact, Serpenoid, ShapeMode
 from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.results.cycles import Transport
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.experiment import Experiment
 from undulog.analysis.results.frequency_response import (
@@ -48,7 +49,7 @@ _FLAT = frozenset(
         analysis.GroupFacts,
         analysis.JointInWindow,
         analysis.JointResult,
-        analysis.Transport,
+        Transport,
         BodyTravel,
         BodyWave,
         JointFrequencyResponse,

@@ -13,10 +13,11 @@ from undulog.capture.common import console as text_table
 from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
-from ..results.analysis import Analysis, EnergyResult
+from ..results.analysis import Analysis
 from ..results.body import BodyShape, GroundContact, PlaneShape
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
+from ..results.cycles import EnergyResult
 from ..results.estimate import Estimate
 from ..results.frequency_response import FreeMotion
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode

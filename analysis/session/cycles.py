@@ -26,8 +26,8 @@ from undulog.capture.common.process import in_threads
 from ..estimators.demodulation import Cycles, Phase, amplitudes, cycles_of, demodulate, weigh
 from ..estimators.intervals import t_factor
 from ..estimators.series import GAP_FACTOR, Series, clean
-from ..results.analysis import Intervals, JointOverTime, Maybe, ResponseOverTime
 from ..results.answer import Artefact, Note, Span
+from ..results.cycles import Intervals, JointOverTime, Maybe, ResponseOverTime
 from ..signals.columns import Columns, planes_of
 from ..signals.stretch import GAIT_TOPIC
 from .fields import SessionMeasurement

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.analysis.results.analysis import (
+from undulog.analysis.results.cycles import (
     EnergyResult,
     JointCycles,
     JointOverTime,
