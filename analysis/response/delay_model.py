@@ -36,6 +36,7 @@ data leave open share its phase."""
 _DELAYS = 21
 _REFINEMENTS, _FINER = 2, 5  # of the grid of delays, each by so much
 _ITERATIONS = 4
+_EPSILON = float(np.finfo(np.float64).eps)
 _HOPELESS = 30.0  # mean square of the residual, in variances, from which no step makes it pass
 
 
@@ -76,21 +77,40 @@ def _polynomial(s: ComplexArray, coefficients: FloatArray) -> ComplexArray:
 
 @dataclass(frozen=True)
 class _Lines:
-    """The measured lines, scaled: s, G over its standard deviation, the weight, w / w_0."""
+    """The measured lines: s, G, one over the deviation of its parts, powers of s."""
 
     s: ComplexArray
     value: ComplexArray
     weight: FloatArray
-
-    def model(self, parameters: FloatArray, order: int) -> ComplexArray:
-        tau, b = parameters[0], parameters[1 : order + 2]
-        a = np.concatenate([[1.0], parameters[order + 2 :]])
-        top = _polynomial(self.s, b)
-        return np.exp(-self.s * tau) * top / _polynomial(self.s, a)
+    powers: ComplexArray
 
     def residual(self, parameters: FloatArray, order: int) -> FloatArray:
-        error = (self.model(parameters, order) - self.value) * self.weight
-        return np.concatenate([error.real, error.imag])
+        """Return the weighted residual of parameters (..., p), shape (..., 2 k)."""
+        delayed, top, bottom = self._parts(parameters, order)
+        return _stacked((delayed * top / bottom - self.value) * self.weight)
+
+    def jacobian(self, parameters: FloatArray, order: int) -> FloatArray:
+        """Return its derivative by the parameters (p,), shape (2 k, p)."""
+        delayed, top, bottom = self._parts(parameters, order)
+        model, count = delayed * top / bottom, parameters.size - order - 2
+        columns = [
+            -self.s * model,
+            *(delayed / bottom * self.powers[:, : order + 1].T),
+            *(-model / bottom * self.powers[:, 1 : count + 1].T),
+        ]
+        return _stacked(np.stack(columns) * self.weight).T
+
+    def _parts(self, parameters: FloatArray, order: int) -> tuple[ComplexArray, ...]:
+        """Return exp(-s tau), B and A at the lines."""
+        tau, b = parameters[..., :1], parameters[..., 1 : order + 2]
+        a = parameters[..., order + 2 :]
+        count = a.shape[-1]
+        bottom = 1.0 + a @ self.powers[:, 1 : count + 1].T
+        return np.exp(-self.s * tau), b @ self.powers[:, : order + 1].T, bottom
+
+
+def _stacked(values: ComplexArray) -> FloatArray:
+    return np.concatenate([values.real, values.imag], axis=-1)
 
 
 def fit_delay(
@@ -110,9 +130,9 @@ def fit_delay(
     omega = 2 * np.pi * frequency_hz
     scale = float(np.exp(np.mean(np.log(omega))))
     # E|e|^2 is shared by real and imaginary part.
-    lines = _Lines(
-        np.asarray(1j * omega / scale, dtype=np.complex128), value, np.sqrt(2.0 / variance)
-    )
+    variable = np.asarray(1j * omega / scale, dtype=np.complex128)
+    powers = variable[:, None] ** np.arange(max(max(orders) for orders in ORDERS) + 1)
+    lines = _Lines(variable, value, np.sqrt(2.0 / variance), powers)
     best = 0.0
     passed: list[DelayModel] = []
     for orders in ORDERS:
@@ -187,40 +207,43 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
     highest = np.abs(lines.s[-1])
     from scipy.optimize import least_squares
 
-    best = None
+    best: tuple[float, FloatArray] | None = None
     step = 2 * np.pi / highest / (_DELAYS - 1)
-    delays = step * np.arange(_DELAYS)
+    delays: FloatArray = step * np.arange(_DELAYS)
     for _ in range(_REFINEMENTS + 1):
-        for tau in delays:
-            start = _linear(lines, tau, top, bottom)
-            cost = float(np.sum(lines.residual(start, top) ** 2))
-            if np.isfinite(cost) and (best is None or cost < best[0]):
-                best = cost, start
-        if best is None:
-            return None
-        if best[0] <= _HOPELESS * 2 * lines.s.size:
+        starts = _linear(lines, delays, top, bottom)
+        costs = np.sum(lines.residual(starts, top) ** 2, axis=1)
+        lowest = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        if best is None or costs[lowest] < best[0]:
+            best = float(costs[lowest]), starts[lowest]
+        if not best[0] > _HOPELESS * 2 * lines.s.size:
             break
         # Precise lines take a start within what their noise allows.
         delays = best[1][0] + step * np.arange(1 - _FINER, _FINER) / _FINER
         step /= _FINER
-    if best is None or best[0] > _HOPELESS * 2 * lines.s.size:
+    if best is None or not best[0] <= _HOPELESS * 2 * lines.s.size:
         return None
-    found: Any = least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)
+    found: Any = least_squares(
+        lines.residual, best[1], jac=lines.jacobian, args=(top,), method="lm", max_nfev=400
+    )
     poles = np.roots(np.append(found.x[: top + 1 : -1], 1.0))
     return found if (poles.real < 0).all() else None
 
 
-def _linear(lines: _Lines, tau: Any, top: int, bottom: int) -> FloatArray:
-    """Return the parameters of Sanathanan and Koerner's iteration at one delay."""
-    undelayed = lines.value * np.exp(lines.s * tau)
-    powers = lines.s[:, None] ** np.arange(max(top, bottom) + 1)
-    weight, found = lines.weight, np.zeros(1 + top + bottom)
+def _linear(lines: _Lines, delays: FloatArray, top: int, bottom: int) -> FloatArray:
+    """Return the parameters of Sanathanan and Koerner's iteration at each delay, shape (d, p)."""
+    undelayed = lines.value * np.exp(lines.s * delays[:, None])
+    numerator = np.broadcast_to(lines.powers[:, : top + 1], (delays.size, lines.s.size, top + 1))
+    left = np.concatenate(
+        [numerator, -undelayed[..., None] * lines.powers[:, 1 : bottom + 1]], axis=2
+    )
+    weight = np.broadcast_to(lines.weight, undelayed.shape)
+    solution = np.zeros((delays.size, 1 + top + bottom))
     for _ in range(_ITERATIONS if bottom else 1):
-        left = np.hstack([powers[:, : top + 1], -undelayed[:, None] * powers[:, 1 : bottom + 1]])
-        left, right = left * weight[:, None], undelayed * weight
-        found = np.linalg.lstsq(
-            np.vstack([left.real, left.imag]), np.concatenate([right.real, right.imag]), rcond=None
-        )[0]
-        below = _polynomial(lines.s, np.append(1.0, found[top + 1 :]))
+        rows = _stacked(np.swapaxes(left * weight[..., None], 1, 2))
+        right = _stacked(undelayed * weight)
+        inverse = np.linalg.pinv(np.swapaxes(rows, 1, 2), rcond=right.shape[1] * _EPSILON)
+        solution = (inverse @ right[..., None])[..., 0]
+        below = 1.0 + solution[:, top + 1 :] @ lines.powers[:, 1 : bottom + 1].T
         weight = lines.weight / np.maximum(np.abs(below), 1e-9)
-    return np.append(tau, found)
+    return np.concatenate([delays[:, None], solution], axis=1)
