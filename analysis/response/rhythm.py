@@ -173,7 +173,11 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
     if any(one.count <= model.size + 1 for one in series):
         return None
     try:
-        fit = fit_shared(scouts, omega, model)
+        fit = fit_at(scouts, omega, model)
+        if not np.any(fit.total):
+            return None
+        if np.max(fit.explained) >= MIN_EXPLAINED / 2:  # else no step makes it a gait
+            fit = fit_shared(scouts, omega, model)
         if len(series) > 1:
             fit = fit_at(series, fit.omega, model)
     except DataError:
