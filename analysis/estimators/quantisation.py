@@ -10,11 +10,19 @@ of a cycle mirrors the first and only 50 are left.
 
 So the error is found by rounding again: the fitted motion, a little larger or smaller at each
 draw, at the very times of the samples, with the noise that the residual has beside the steps.
+
+A reading with hysteresis h is late by h / 2 in both directions, -(h / 2) sgn(v) of a motion with
+velocity v, whose fundamental (2 / pi) h lies at right angles to the motion's (Tustin, J. IEE 94 IIA
+(1947) 143-151, of backlash): a lag that the joint doesn't have. What the square wave has beyond the
+harmonics of the fit decides, by the likelihood of the residual after rounding. A dead band of the
+joint looks the same, and of more than a step or so it is one; up to that the lag's interval holds
+both.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr
 
 from undulog.capture.common.arrays import FloatArray
 
@@ -48,6 +56,21 @@ _RANGE = 8.0
 """Draws differ in amplitude by up to this many steps, and at most by ``_SHARE`` of it."""
 
 _SHARE = 0.2
+
+_HYSTERESES = (0.25, 0.5, 0.75, 1.0, 1.25)
+"""In steps; a comparator's is one at most, or it is a fault (IEEE Std 1241-2010, 9.6)."""
+
+_DEAD_BANDS = (1.5, 1.75, 2.0)
+"""In steps: what fits better is a dead band of the joint."""
+
+_DECIDED = 7.0
+"""Logarithm of the likelihood ratio from which a reading has hysteresis: a thousand to one."""
+
+_INEXACT = 0.05
+"""Standard deviation of the fitted motion in steps, at the least."""
+
+_IMPOSSIBLE = 1e-12
+"""Likelihood of a sample that the model excludes."""
 
 
 def lattice_step(values: FloatArray) -> float:
@@ -157,6 +180,74 @@ def rounding_covariance(
         error += step * (np.rint(rounded) - place) @ (weight @ rows).T
     kept, turned = (part.T @ part / len(part) for part in (error[::2], error[1::2]))
     return turned + not_negative(kept - turned)
+
+
+def hysteresis_covariance(
+    one: Series, fit: HarmonicFit, channel: int, step: float
+) -> FloatArray | None:
+    """Return what hysteresis of a reading can move the fundamental by, as a covariance.
+
+    Args:
+        fit: The fit that holds it.
+        channel: Its index in the fit.
+        step: Of its lattice.
+
+    Returns:
+        Of (Re a, Im a), shape (2, 2), across the motion; None where the residual shows no
+        hysteresis, or one that no reading has.
+    """
+    amplitude = fit.fundamental[channel]
+    if not abs(amplitude) > 2 * _HYSTERESES[-1] * step:
+        return None
+    t_s, values = one.t_s, one.values
+    if one.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
+        index = np.sort(np.random.default_rng(0).choice(one.count, _LOOKED_AT, replace=False))
+        t_s, values = t_s[index], values[index]
+    scale = time_scale(one.t_s)
+    rows = basis(t_s, fit.omega, fit.model, scale)
+    residual = (values - fit.parameters([channel], scale)[0] @ rows) / step
+    turns = fit.omega * t_s / (2 * np.pi) % 1
+    different = np.unique(np.rint(2 * t_s.size * turns) % (2 * t_s.size)).size
+    inexact = max(_INEXACT, (len(rows) / (12 * different)) ** 0.5)
+    phase = np.angle(amplitude * np.exp(1j * fit.omega * t_s))
+    fitted = np.linalg.qr(rows.T)[0]
+
+    def tried(hysteresis: float) -> tuple[float, float, float]:
+        late = hysteresis * _late(phase, hysteresis * step / abs(amplitude))
+        late -= fitted @ (fitted.T @ late)
+        return (*_likelihood(residual - late, inexact), hysteresis)
+
+    none, *_ = _likelihood(residual, inexact)
+    likelihood, noise, best = max(tried(width) for width in _HYSTERESES)
+    wider = max(tried(width)[0] for width in _DEAD_BANDS)
+    # What rounding does in each cycle again counts once: exp(-(2 pi s)^2) of its power.
+    again = float(np.exp(-((2 * np.pi * noise) ** 2))) * (1 - different / t_s.size)
+    if (1 - again) * min(likelihood - none, likelihood - wider + 2 * _DECIDED) < _DECIDED:
+        return None
+    across = 1j * amplitude / abs(amplitude) * (2 / np.pi) * best * step
+    parts = np.array([across.real, across.imag])
+    return np.outer(parts, parts)
+
+
+def _likelihood(residual: FloatArray, inexact: float) -> tuple[float, float]:
+    """Return the logarithm of the likelihood of what rounding leaves, in steps, and its noise."""
+    noise = max(float(np.mean(residual**2)) - 1 / 12, inexact**2) ** 0.5
+    shares: FloatArray = ndtr((0.5 - residual) / noise) - ndtr((-0.5 - residual) / noise)
+    return float(np.sum(np.log(np.maximum(shares, _IMPOSSIBLE)))), noise
+
+
+def _late(phase: FloatArray, width: float) -> FloatArray:
+    """Return what a reading with a hysteresis of one is above a cosine.
+
+    From a peak on it stays, until the motion has come back by the hysteresis.
+
+    Args:
+        phase: Of the cosine in (-pi, pi], shape (n,).
+        width: Hysteresis over the amplitude.
+    """
+    since: FloatArray = np.where(phase < 0, phase + np.pi, phase)
+    late: FloatArray = np.minimum((1 - np.cos(since)) / width, 1.0) - 0.5
+    return np.where(phase < 0, -late, late)
 
 
 def not_negative(symmetric: FloatArray) -> FloatArray:

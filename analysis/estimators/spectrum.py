@@ -24,6 +24,7 @@ from .harmonic import RELATIVE_FLOOR, HarmonicFit, HarmonicModel, basis, chunks,
 from .quantisation import (
     DRAWS,
     draws,
+    hysteresis_covariance,
     lattice_step,
     not_negative,
     rounding_covariance,
@@ -108,7 +109,8 @@ class ResidualBins:
             of ``spread |value|^2`` is E|error of a|^2.
         rounding: Covariance of (Re a, Im a) that rounding, to steps or of numbers, adds to what
             the bins show, shape (K, 2, 2); it is counted as each channel's own.
-        steps: The same by rounding to steps alone, whatever the bins show; None for zero.
+        steps: The same by rounding to steps, and by a reading's hysteresis, alone, whatever the
+            bins show; None for zero.
     """
 
     values: ComplexArray
@@ -188,7 +190,8 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         covariance[k] = level[k] * shape
     rounding = floor[:, None, None] * block
     steps = np.zeros_like(rounding)
-    for k, rounded in _rounded(series, fit, level):
+    lattices = [lattice_step(channel.values) for channel in series]
+    for k, rounded in _rounded(series, fit, level, lattices):
         steps[k] = rounded
         if np.trace(rounded) > RAISED * spread[k] * level[k]:
             more = not_negative(rounded - covariance[k])
@@ -196,6 +199,11 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
             covariance[k] += more
             level[k] = np.trace(covariance[k]) / spread[k]
             dof[k] = draws(series[k].count)
+    for k, step in enumerate(lattices):
+        late = hysteresis_covariance(series[k], fit, k, step) if step > 0 else None
+        if late is not None:
+            for total in (covariance, rounding, steps):
+                total[k] += late
     common = [common for common, _ in found]
     bins = _common_bins(groups, common, shortest, spread, rounding)
     return Noise(level, dof, covariance), replace(bins, steps=steps)
@@ -226,12 +234,11 @@ def _modulated(channel: Series, fit: HarmonicFit, k: int) -> FloatArray:
 
 
 def _rounded(
-    series: Sequence[Series], fit: HarmonicFit, level: FloatArray
+    series: Sequence[Series], fit: HarmonicFit, level: FloatArray, lattices: Sequence[float]
 ) -> list[tuple[int, FloatArray]]:
     """Return the channels whose rounding no noise makes white, and the covariance that it makes."""
     found: list[tuple[int, float, float]] = []
-    for k, one in enumerate(series):
-        step = lattice_step(one.values)
+    for k, step in enumerate(lattices):
         noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
         if noise is not None:
             found.append((k, step, noise))

@@ -72,6 +72,38 @@ def test_the_residual_alone_does_not_show_the_error():
     assert np.all(estimator_tables.rounded(draws=100)[1] < 0.1)
 
 
+def read_with_hysteresis(values, steps):
+    """Round what a backlash of some steps leaves of values."""
+    reading, held = np.empty(values.size), values[0]
+    for k, value in enumerate(values):
+        held = min(max(held, value - steps * STEP / 2), value + steps * STEP / 2)
+        reading[k] = held
+    return STEP * np.rint(reading / STEP)
+
+
+STEP = 2 * np.pi / 4096
+
+
+@pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50, 0.8), (200, 0.73)])
+@pytest.mark.parametrize(("steps", "least", "most"), [(1, 0.9, 1), (0, 0, 0.05), (6, 0, 0.05)])
+def test_an_interval_holds_a_lag_that_the_hysteresis_of_a_count_may_have_made(
+    rate_hz, frequency_hz, steps, least, most
+):
+    """A backlash of h turns the fundamental by (2 / pi) h / A; one of many steps is the joint's."""
+    random = np.random.default_rng(4)
+    t, omega = np.arange(0, 20, 1 / rate_hz), 2 * np.pi * frequency_hz
+    held = []
+    for phase in random.uniform(0, 2 * np.pi, 20):
+        wave = 0.25 * np.cos(omega * t + phase) + random.normal(0, 0.2 * STEP, t.size)
+        series = [Series("q", t, read_with_hysteresis(wave, steps))]
+        fit = fit_at(series, omega)
+        noise, _ = residual_spectrum(series, fit)
+        across = 1j * np.exp(1j * np.array([phase]))
+        made = 2 / np.pi * max(steps, 1) * STEP
+        held.append(1.96 * noise.along(across)[0] ** 0.5 > made)
+    assert least <= np.mean(held) <= most
+
+
 def test_noise_that_is_not_rounded_keeps_its_intervals():
     random = np.random.default_rng(3)
     series = [Series("q", np.arange(1000) / 50, turn(0.5, 1000) + random.normal(0, 1e-3, 1000))]
