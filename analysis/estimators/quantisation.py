@@ -232,7 +232,9 @@ def hysteresis_covariance(
 def _likelihood(residual: FloatArray, inexact: float) -> tuple[float, float]:
     """Return the logarithm of the likelihood of what rounding leaves, in steps, and its noise."""
     noise = max(float(np.mean(residual**2)) - 1 / 12, inexact**2) ** 0.5
-    shares: FloatArray = ndtr((0.5 - residual) / noise) - ndtr((-0.5 - residual) / noise)
+    ends = np.stack([residual + 0.5, residual - 0.5]) / noise
+    above, below = np.asarray(ndtr(ends), dtype=np.float64)
+    shares = above - below
     return float(np.sum(np.log(np.maximum(shares, _IMPOSSIBLE)))), noise
 
 
