@@ -37,6 +37,29 @@ from .results.estimate import Estimate
 from .signals.columns import Columns
 from .signals.windows import Span
 
+TERMS = {
+    "net": ("mechanical", "net_j", "mechanical_net"),
+    "plus": ("mechanical", "plus_j", "mechanical_plus"),
+    "abs": ("mechanical", "abs_j", "mechanical_abs"),
+    "el": ("electrical", "net_j", "electrical_net"),
+    "el_clipped": ("electrical", "plus_j", "electrical_plus"),
+}
+"""Energy to its kind, its attribute of :class:`Energy`, and its term in the ledger."""
+
+GAP_SHARE = 0.01
+"""More of the window without samples is worth a flag, or of power a warning."""
+
+STEADY_SHARE = 0.2
+"""A voltage that varies by less than this part of its mean is a supply's: a motor's follows the
+duty, through zero and back in every cycle."""
+
+LEDGER_TOPIC = "/energy_ledger"
+TOLERANCE = 0.05
+"""Difference, as a share of the absolute energy, that is worth a warning."""
+
+LEAST_WAY = 0.01
+"""Displacement in a cycle, over the body's length, below which a robot goes nowhere."""
+
 
 @dataclass(frozen=True)
 class Energy:
@@ -153,16 +176,6 @@ def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
     return values
 
 
-TERMS = {
-    "net": ("mechanical", "net_j", "mechanical_net"),
-    "plus": ("mechanical", "plus_j", "mechanical_plus"),
-    "abs": ("mechanical", "abs_j", "mechanical_abs"),
-    "el": ("electrical", "net_j", "electrical_net"),
-    "el_clipped": ("electrical", "plus_j", "electrical_plus"),
-}
-"""Energy to its kind, its attribute of :class:`Energy`, and its term in the ledger."""
-
-
 @dataclass(frozen=True)
 class Energies:
     """Energies of one joint.
@@ -182,10 +195,6 @@ class Energies:
         kind, attribute, _ = TERMS[name]
         energy: Energy | None = getattr(self, kind)
         return None if energy is None else getattr(energy, attribute)
-
-
-GAP_SHARE = 0.01
-"""More of the window without samples is worth a flag, or of power a warning."""
 
 
 def joint_energies(
@@ -242,11 +251,6 @@ def _accumulated(
         return None
     mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
     return add_up(mean, positive, *window)
-
-
-STEADY_SHARE = 0.2
-"""A voltage that varies by less than this part of its mean is a supply's: a motor's follows the
-duty, through zero and back in every cycle."""
 
 
 def energy_result(
@@ -324,11 +328,6 @@ def _all_steady(voltages: Iterable[FloatArray]) -> bool:
 
 def _each(values: FloatArray | None) -> Each:
     return None if values is None else tuple(values.tolist())
-
-
-LEDGER_TOPIC = "/energy_ledger"
-TOLERANCE = 0.05
-"""Difference, as a share of the absolute energy, that is worth a warning."""
 
 
 def check_ledger(
@@ -411,10 +410,6 @@ def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
         if known := [one for joint in joints if (one := getattr(joint, kind)) is not None]:
             sums[name] = sum(float(getattr(one, part).sum()) for one in known)
     return sums
-
-
-LEAST_WAY = 0.01
-"""Displacement in a cycle, over the body's length, below which a robot goes nowhere."""
 
 
 def transport(

@@ -35,6 +35,13 @@ GIF_FPS = 50
 
 _COLORS = 128
 
+SIDES = (160, 2160)
+"""Shortest and longest side of a clip [pixels]."""
+
+# What this viewer draws around a single view [pixels]; measured again where it does not.
+_FRAME = (7, 71)
+_SAMPLES = 8
+
 
 @contextmanager
 def open_film(
@@ -176,14 +183,6 @@ class _Mp4(Film):
                 dst_color_trc=ColorTrc.IEC61966_2_1,
             )
         )
-
-
-SIDES = (160, 2160)
-"""Shortest and longest side of a clip [pixels]."""
-
-# What this viewer draws around a single view [pixels]; measured again where it does not.
-_FRAME = (7, 71)
-_SAMPLES = 8
 
 
 @dataclass(frozen=True)

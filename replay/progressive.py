@@ -55,6 +55,20 @@ from .samples.tracks import wanted_fields
 from .stream import BoundedStream, keep_for_ever
 from .viewer import Viewer
 
+TAKES_S = 300.0
+"""Longest time for which the viewer may take nothing of what was sent [s]: a computer that draws
+without a graphics card takes tens of seconds for a large stretch."""
+
+_VIEWER = "the Rerun viewer"
+_ADVICE = "it is frozen or too busy; the session is unchanged, so start the command again"
+ENDS_S = 3.0
+"""A viewer that severs the connection is given this time to end, e.g. by a signal [s].
+
+Its memory is given back between the two, which takes long on a busy computer.
+"""
+_TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
+_FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
+
 
 def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
     """Add the views that an analysis of such a session adds.
@@ -125,21 +139,6 @@ def _names(series: tuple[Series, ...]) -> tuple[str, ...]:
 
 def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
     return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
-
-
-TAKES_S = 300.0
-"""Longest time for which the viewer may take nothing of what was sent [s]: a computer that draws
-without a graphics card takes tens of seconds for a large stretch."""
-
-_VIEWER = "the Rerun viewer"
-_ADVICE = "it is frozen or too busy; the session is unchanged, so start the command again"
-ENDS_S = 3.0
-"""A viewer that severs the connection is given this time to end, e.g. by a signal [s].
-
-Its memory is given back between the two, which takes long on a busy computer.
-"""
-_TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
-_FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
 
 class NoLongerWantedError(Exception):

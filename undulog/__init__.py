@@ -72,15 +72,6 @@ _HOMES = {
 }
 """Module of this package to the names of ``__all__`` that are imported from it."""
 
-
-def __getattr__(name: str) -> Any:
-    """Import a name of ``__all__`` when it is first used."""
-    for module, names in _HOMES.items():
-        if name in names.split():
-            return getattr(import_module(f".{module}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture record:record", "Record a robot, or its twin, into a session."),
     "record status": ("capture record:status", "Show the state of the running recordings."),
@@ -160,6 +151,14 @@ _OF_LINEAR_ALGEBRA = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 What the user has set stays."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """What writing to a full or failing disk raises."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of ``__all__`` when it is first used."""
+    for module, names in _HOMES.items():
+        if name in names.split():
+            return getattr(import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def build(arguments: Sequence[str] = ()) -> App:

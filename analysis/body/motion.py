@@ -34,6 +34,16 @@ TREND = 2
 
 _CHUNK = 8192
 
+ODOMETRY_TOPIC = "/odom"
+
+_CHILD = "child_frame_id"
+_POSE = (
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+)
+_BENT_RAD = float(np.radians(2.0))
+"""Joints that are not driven, but bent by more than this, make the planar null doubtful."""
+
 
 @dataclass(frozen=True)
 class Track:
@@ -220,17 +230,6 @@ def _phase(fit: HarmonicFit, sideways: FloatArray, k: int, factor: float) -> Est
         return Estimate()
     angle = _angle(fit.fundamental, k)
     return Estimate(angle, around(angle, float(np.arcsin(sine))))
-
-
-ODOMETRY_TOPIC = "/odom"
-
-_CHILD = "child_frame_id"
-_POSE = (
-    *(f"pose.pose.position.{axis}" for axis in "xyz"),
-    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
-)
-_BENT_RAD = float(np.radians(2.0))
-"""Joints that are not driven, but bent by more than this, make the planar null doubtful."""
 
 
 def body_motion(

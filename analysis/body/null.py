@@ -22,6 +22,9 @@ from undulog.capture.robot.model import Plane, Robot
 
 from ..signals.columns import DRAG_RATIO
 
+SAMPLES = 128
+"""Times per cycle: enough for the eighth harmonic of the head's motion many times over."""
+
 
 @dataclass(frozen=True)
 class Chain:
@@ -134,10 +137,6 @@ def travel(velocity: FloatArray, omega: float) -> tuple[ComplexArray, FloatArray
     path = _integral(omegas + mean_turn, time_s) @ slip
     heading = mean_turn * time_s[:-1] + swing
     return path[:-1], heading, complex(path[-1]), 2 * np.pi * mean_turn / omega
-
-
-SAMPLES = 128
-"""Times per cycle: enough for the eighth harmonic of the head's motion many times over."""
 
 
 def places(chain: Chain, motion: Motion, links: tuple[int, ...], cycles: int) -> ComplexArray:

@@ -39,6 +39,15 @@ _NOTHING = "no speed and no cost of transport"
 _CLEAR = 3.0
 """A mean step per cycle below so many standard errors is no transport."""
 
+ROUND = 0.7
+"""Beyond this ratio of the short to the long semi-axis the axes are not those of a long body."""
+
+HARMONICS = 6
+"""Of shape and velocity within a cycle."""
+
+PHASES: FloatArray = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+"""Of one cycle, at which velocities are integrated [rad]."""
+
 
 @dataclass(frozen=True)
 class Steps:
@@ -179,13 +188,6 @@ def cost_of_transport(steps: Steps, energy_j: FloatArray) -> tuple[float, float,
     value = float(energy_j.mean()) / (weight * step)
     rest = energy_j - value * weight * steps.forward_m
     return value, float(rest.var(ddof=1) / rest.size) / (weight * step) ** 2, dof
-
-
-ROUND = 0.7
-"""Beyond this ratio of the short to the long semi-axis the axes are not those of a long body."""
-
-HARMONICS = 6
-"""Of shape and velocity within a cycle."""
 
 
 @dataclass(frozen=True)
@@ -358,7 +360,3 @@ def step_of_cycle(velocity: FloatArray) -> FloatArray:
     _, heading, displacement, turn = travel(velocity.T, 1.0)
     gone = displacement * np.exp(-1j * float(heading.mean()))
     return np.array([gone.real, gone.imag, turn])
-
-
-PHASES: FloatArray = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
-"""Of one cycle, at which velocities are integrated [rad]."""

@@ -53,6 +53,85 @@ _TRACKED = {
 }
 """Numbers of a joint whose commands are no gait, and their columns."""
 
+_OF_SESSION = ("session_id", "robot", "scenario", "operator", "engine")
+
+_CLOSED = (
+    "python_enable_replacements = false",
+    "enable_external_access = false",
+    "lock_configuration = true",
+)
+
+# The base holds one row of each source (and joint), the other rows are few: only these are sorted.
+_CURRENT = """
+create temp view {view} as
+select * exclude (removed) from {table}_base
+where {source} not in (select {source} from {table}_new)
+union all by name
+select * exclude (removed) from {table}_new
+qualify scanned_ns = max(scanned_ns) over (partition by {source}) and not removed
+"""
+
+_SESSIONS = """
+create temp view sessions as
+select path, session_id, robot, metadata ->> '$.serial' as serial, scenario, operator, engine,
+  verdict, software, seed, start, start_ns, end_ns, duration_s, messages, size, 1 as parts,
+  damage, topics, metadata
+from files
+"""
+
+_SPLIT_SESSIONS = """
+create temp view sessions as
+select head as path, first(session_id order by part) as session_id,
+  first(robot order by part) as robot, first(metadata ->> '$.serial' order by part) as serial,
+  first(scenario order by part) as scenario,
+  first(operator order by part) as operator, first(engine order by part) as engine,
+  last(verdict order by part) as verdict, first(software order by part) as software,
+  first(seed order by part) as seed, min(start) as start, min(start_ns) as start_ns,
+  max(end_ns) as end_ns, (max(end_ns) - min(start_ns)) / 1e9 as duration_s,
+  sum(messages)::bigint as messages, sum(size)::bigint as size, count(*) as parts,
+  string_agg(damage, '; ' order by part) as damage, first(topics order by part) as topics,
+  first(metadata order by part) as metadata
+from files group by head
+"""
+
+_AFFECTED = """
+create temp table affected as
+select session_id from analyses_new where session_id is not null
+union select session_id from analyses_base where source in (select source from analyses_new)
+"""
+
+_ANALYSES = """
+create temp view analyses as
+select * exclude (latest) from all_analyses
+where latest and session_id not in (from affected)
+union all by name
+select * exclude (latest) from all_analyses where session_id in (from affected)
+qualify row_number() over (partition by session_id order by scanned_ns desc, source) = 1
+"""
+
+_LATEST = "row_number() over (partition by session_id order by scanned_ns desc, source) = 1"
+
+_CATALOG = """
+create temp view catalog as
+select sessions.*,
+  case when analyses.session_id is null then 'not analysed' else 'analysed' end as status,
+  analyses.* exclude (session_id, modified_ns, scanned_ns)
+from sessions left join analyses on sessions.session_id = analyses.session_id and {own}
+"""
+
+_JOINTS = """
+create temp view joints as
+select sessions.path, sessions.robot, sessions.serial, sessions.start,
+  all_joints.* exclude (modified_ns, scanned_ns)
+from all_joints left join sessions on sessions.session_id = all_joints.session_id and {own}
+"""
+
+# A damaged copy has the id of the whole session, but not its results.
+_OWN = """
+(damage is null
+  or sessions.session_id not in (select session_id from sessions where damage is null))
+"""
+
 
 def _with_interval(*names: str) -> list[str]:
     return [column for name in names for column in (name, f"{name}_low", f"{name}_high")]
@@ -119,9 +198,6 @@ def table_of(kind: str, rows: Sequence[Row]) -> Any:
         _ARROW.array([row.get(field.name) for row in rows], type=field.type) for field in schema
     ]
     return _ARROW.table(columns, schema=schema)
-
-
-_OF_SESSION = ("session_id", "robot", "scenario", "operator", "engine")
 
 
 def session_row(facts: LogFacts) -> Row:
@@ -271,82 +347,6 @@ _BOUNDED: _Config = {
     "temp_directory": "",  # nothing is written beside the catalogue
     "autoload_known_extensions": "false",
 }
-_CLOSED = (
-    "python_enable_replacements = false",
-    "enable_external_access = false",
-    "lock_configuration = true",
-)
-
-# The base holds one row of each source (and joint), the other rows are few: only these are sorted.
-_CURRENT = """
-create temp view {view} as
-select * exclude (removed) from {table}_base
-where {source} not in (select {source} from {table}_new)
-union all by name
-select * exclude (removed) from {table}_new
-qualify scanned_ns = max(scanned_ns) over (partition by {source}) and not removed
-"""
-
-_SESSIONS = """
-create temp view sessions as
-select path, session_id, robot, metadata ->> '$.serial' as serial, scenario, operator, engine,
-  verdict, software, seed, start, start_ns, end_ns, duration_s, messages, size, 1 as parts,
-  damage, topics, metadata
-from files
-"""
-
-_SPLIT_SESSIONS = """
-create temp view sessions as
-select head as path, first(session_id order by part) as session_id,
-  first(robot order by part) as robot, first(metadata ->> '$.serial' order by part) as serial,
-  first(scenario order by part) as scenario,
-  first(operator order by part) as operator, first(engine order by part) as engine,
-  last(verdict order by part) as verdict, first(software order by part) as software,
-  first(seed order by part) as seed, min(start) as start, min(start_ns) as start_ns,
-  max(end_ns) as end_ns, (max(end_ns) - min(start_ns)) / 1e9 as duration_s,
-  sum(messages)::bigint as messages, sum(size)::bigint as size, count(*) as parts,
-  string_agg(damage, '; ' order by part) as damage, first(topics order by part) as topics,
-  first(metadata order by part) as metadata
-from files group by head
-"""
-
-_AFFECTED = """
-create temp table affected as
-select session_id from analyses_new where session_id is not null
-union select session_id from analyses_base where source in (select source from analyses_new)
-"""
-
-_ANALYSES = """
-create temp view analyses as
-select * exclude (latest) from all_analyses
-where latest and session_id not in (from affected)
-union all by name
-select * exclude (latest) from all_analyses where session_id in (from affected)
-qualify row_number() over (partition by session_id order by scanned_ns desc, source) = 1
-"""
-
-_LATEST = "row_number() over (partition by session_id order by scanned_ns desc, source) = 1"
-
-_CATALOG = """
-create temp view catalog as
-select sessions.*,
-  case when analyses.session_id is null then 'not analysed' else 'analysed' end as status,
-  analyses.* exclude (session_id, modified_ns, scanned_ns)
-from sessions left join analyses on sessions.session_id = analyses.session_id and {own}
-"""
-
-_JOINTS = """
-create temp view joints as
-select sessions.path, sessions.robot, sessions.serial, sessions.start,
-  all_joints.* exclude (modified_ns, scanned_ns)
-from all_joints left join sessions on sessions.session_id = all_joints.session_id and {own}
-"""
-
-# A damaged copy has the id of the whole session, but not its results.
-_OWN = """
-(damage is null
-  or sessions.session_id not in (select session_id from sessions where damage is null))
-"""
 
 
 @contextmanager

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from ..results.experiment import Experiment
     from ..signals.stretch import Options
 
+PAGES = (".html", ".htm")
+"""How the name of a page ends."""
+
 
 def analyse(
     *files: Path,
@@ -229,10 +232,6 @@ def experiment_of(
 
     with progress(verb, total=len(files)) as bar:
         return analyse_experiment(opened(files, bar, robot=robot), options)
-
-
-PAGES = (".html", ".htm")
-"""How the name of a page ends."""
 
 
 def chosen(

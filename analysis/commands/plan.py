@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 LEAST, MOST = 0.01, 0.12
 """Kicks that the analysis accepts; others are reported as too small or large."""
 
+AMPLITUDE = 0.02
+_LEAST_SETTLE_S = 10.0
+
+_MOST_RUNS = 1000
+
 
 def phase_kicks(
     *,
@@ -176,10 +181,6 @@ def write_sessions(
     echo(*planned.notes)
 
 
-AMPLITUDE = 0.02
-_LEAST_SETTLE_S = 10.0
-
-
 def lag_sweep(
     *,
     like: Path,
@@ -307,9 +308,6 @@ def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionV
                 f"{joint.servo.proportional_gain * size[row]:.2f}, 1 is full duty; lower "
                 "--amplitude"
             )
-
-
-_MOST_RUNS = 1000
 
 
 @Parameter(name="*")

@@ -46,6 +46,18 @@ UNITS = {quantity: unit for quantity, (_, unit) in _COMPARED.items()}
 _BY_RATIO = ("gain", "amplitude", "frequency")
 _CYCLIC = ("lag", "phase_lag")
 
+MOST = 4
+"""Broken or differing joints that the sentence lists at most."""
+
+RESPONSE = ("gain", "lag", "delay", "amplitude", "phase_lag", "rest_amplitude")
+"""Quantities of a joint that make it a different one."""
+
+_SAME = ("gain", "lag", "delay", "amplitude", "phase_lag", "frequency")
+"""Quantities that two sides have in common if they are the same; other waves follow from them."""
+
+MOVED, DIFFERS = "moved", "differs"
+"""What an offset does between two sessions of one robot with the same commands, and of others."""
+
 
 @dataclass(frozen=True)
 class Margins:
@@ -250,19 +262,6 @@ def _equivalence(
         unit = "1" if kind in _BY_RATIO else UNITS[kind]
         results.append(Equivalence(kind, within, unit, float(np.abs(value).max()), p))
     return tuple(results)
-
-
-MOST = 4
-"""Broken or differing joints that the sentence lists at most."""
-
-RESPONSE = ("gain", "lag", "delay", "amplitude", "phase_lag", "rest_amplitude")
-"""Quantities of a joint that make it a different one."""
-
-_SAME = ("gain", "lag", "delay", "amplitude", "phase_lag", "frequency")
-"""Quantities that two sides have in common if they are the same; other waves follow from them."""
-
-MOVED, DIFFERS = "moved", "differs"
-"""What an offset does between two sessions of one robot with the same commands, and of others."""
 
 
 def answer_of(

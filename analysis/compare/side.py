@@ -38,6 +38,20 @@ from .tracking import MeanCommand, mean_commands, offset_estimates, tracking_est
 PHASES = 72
 """Phases of a mean cycle, every 5 degrees."""
 
+_OF_THE_RUN = frozenset(
+    {
+        *("session_id", "epoch_ns", "seed", "scenario", "source_session"),
+        *("driven.by", "driven.session_id", "planned_duration_s"),
+    }
+)
+"""Facts that name a run rather than describe how it was made."""
+
+_TEXTS = frozenset({"name", "description", "serial", "seed", "epoch_s", "robot"})
+"""Keys of an attached file without an effect, or that the metadata repeats."""
+
+_FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
+_ORDER = ("robot", *_FILES, "session")
+
 
 def phases_rad() -> FloatArray:
     """Return the phases of a mean cycle.
@@ -89,21 +103,6 @@ def _whole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> BoolArray:
         & (gaps[i] == gaps[j])
     )
     return whole
-
-
-_OF_THE_RUN = frozenset(
-    {
-        *("session_id", "epoch_ns", "seed", "scenario", "source_session"),
-        *("driven.by", "driven.session_id", "planned_duration_s"),
-    }
-)
-"""Facts that name a run rather than describe how it was made."""
-
-_TEXTS = frozenset({"name", "description", "serial", "seed", "epoch_s", "robot"})
-"""Keys of an attached file without an effect, or that the metadata repeats."""
-
-_FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
-_ORDER = ("robot", *_FILES, "session")
 
 
 def facts_of(session: SessionView) -> dict[str, str]:

@@ -35,6 +35,33 @@ _INNER = 0.6
 _SURE = 3.0
 _FEW = 3
 
+MOST_CYCLES = 12
+"""Cycles that are fitted, evenly spread over the stretch: an hour costs no more than a minute."""
+
+RESOLVED = 4.0
+"""A dead band of fewer steps of the encoder isn't claimed."""
+
+_FOLLOWS = 0.1
+"""Least gain of a joint that follows its command."""
+
+_HINT = 0.15
+"""Least width that a loop must hint at, as a share of ``RESOLVED`` steps, for a closer look."""
+
+_CLEAR = 20.0
+"""Gain in log likelihood, times two, over a joint without a dead band."""
+
+_ODD = (1, 3, 5, 7)
+"""Harmonics that hold seven tenths of what a square wave adds to its fundamental."""
+
+_CREEP = 0.1
+"""A joint at rest moves by less than this share of what its command would have it move by."""
+
+_SETTLING = 0.25
+"""Part of each plateau that is left out at its start: the joint may still arrive."""
+
+_SHORTEST, _LONG = 3, 8
+"""Samples that a plateau has at least, and so many that three parts of it are compared."""
+
 
 @dataclass(frozen=True)
 class Witness:
@@ -167,34 +194,6 @@ def fundamental_change(
     both = np.linalg.lstsq(basis, np.column_stack((command, followed)), rcond=None)[0]
     waves = both[1] - 1j * both[2]
     return complex(waves[1] / waves[0]) if waves[0] != 0 else complex("nan")
-
-
-MOST_CYCLES = 12
-"""Cycles that are fitted, evenly spread over the stretch: an hour costs no more than a minute."""
-
-RESOLVED = 4.0
-"""A dead band of fewer steps of the encoder isn't claimed."""
-
-_FOLLOWS = 0.1
-"""Least gain of a joint that follows its command."""
-
-_HINT = 0.15
-"""Least width that a loop must hint at, as a share of ``RESOLVED`` steps, for a closer look."""
-
-_CLEAR = 20.0
-"""Gain in log likelihood, times two, over a joint without a dead band."""
-
-_ODD = (1, 3, 5, 7)
-"""Harmonics that hold seven tenths of what a square wave adds to its fundamental."""
-
-_CREEP = 0.1
-"""A joint at rest moves by less than this share of what its command would have it move by."""
-
-_SETTLING = 0.25
-"""Part of each plateau that is left out at its start: the joint may still arrive."""
-
-_SHORTEST, _LONG = 3, 8
-"""Samples that a plateau has at least, and so many that three parts of it are compared."""
 
 
 def dead_bands(

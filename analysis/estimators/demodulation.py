@@ -34,6 +34,28 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 _EDGE = 1e-6
 """Of a cycle: a sample at its edge but for rounding is the first of the one that begins there."""
 
+_LEAST_SAMPLES = 6
+"""Samples that a cycle's amplitude needs."""
+
+MIN_SAMPLES = 12
+"""Samples that a cycle needs."""
+
+MOST_CYCLES = 100
+"""Cycles for each sample of the phase, at most: a phase that runs faster is no phase."""
+
+MIN_EXPLAINED = 0.8
+"""Share of a command's variance in a cycle that the phase must explain."""
+
+DRIVEN_SHARE = 0.05
+"""A cycle whose command is smaller than this share of the joint's largest is not driven."""
+
+MIN_DIFFERENCES = 3
+"""Second differences that the noise is estimated from, at least."""
+
+_TURN = 2 * np.pi
+_TOGETHER = 8192
+"""Samples of the cycles that are summed in one go."""
+
 
 @dataclass(frozen=True)
 class Weighed:
@@ -105,10 +127,6 @@ def cycle_sums(values: NDArray[_Number], starts: IntArray) -> NDArray[_Number]:
     return sums
 
 
-_LEAST_SAMPLES = 6
-"""Samples that a cycle's amplitude needs."""
-
-
 def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: float) -> ComplexArray:
     """Complex amplitude of each cycle, from its samples alone.
 
@@ -143,26 +161,6 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
     solved = np.linalg.solve(gram.T[known], each.transpose(2, 0, 1))
     result[..., known] = (solved[:, 1] + 1j * solved[:, 2]).T.reshape(result[..., known].shape)
     return result
-
-
-MIN_SAMPLES = 12
-"""Samples that a cycle needs."""
-
-MOST_CYCLES = 100
-"""Cycles for each sample of the phase, at most: a phase that runs faster is no phase."""
-
-MIN_EXPLAINED = 0.8
-"""Share of a command's variance in a cycle that the phase must explain."""
-
-DRIVEN_SHARE = 0.05
-"""A cycle whose command is smaller than this share of the joint's largest is not driven."""
-
-MIN_DIFFERENCES = 3
-"""Second differences that the noise is estimated from, at least."""
-
-_TURN = 2 * np.pi
-_TOGETHER = 8192
-"""Samples of the cycles that are summed in one go."""
 
 
 @dataclass(frozen=True)

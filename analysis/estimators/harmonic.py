@@ -29,6 +29,20 @@ from undulog.capture.common.process import in_threads
 
 from .series import Series, shared_times
 
+CHUNK = 8192
+"""Samples per chunk: few enough for the processor's cache, enough to keep two threads apart."""
+
+RELATIVE_FLOOR = 1e-13
+"""Residual power that counts as none, relative to the signal's: an exact channel's residual is
+rounding, and must not get infinite weight."""
+
+MAX_STEPS = 30
+"""Gauss-Newton steps; from a periodogram's peak three to five are enough."""
+
+LINEAR = 1e-7
+"""A step of omega that turns the record's ends by less than this [rad] is the last: amplitudes go
+on linearly with it, and what is neglected, a share of its square, is rounding."""
+
 
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cosine and sine of one set of angles.
@@ -55,19 +69,10 @@ def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     return cosine, sine
 
 
-CHUNK = 8192
-"""Samples per chunk: few enough for the processor's cache, enough to keep two threads apart."""
-
-
 def chunks(count: int) -> Iterator[slice]:
     """Slices that cut a record into pieces of at most ``CHUNK`` samples."""
     for start in range(0, count, CHUNK):
         yield slice(start, min(start + CHUNK, count))
-
-
-RELATIVE_FLOOR = 1e-13
-"""Residual power that counts as none, relative to the signal's: an exact channel's residual is
-rounding, and must not get infinite weight."""
 
 
 @dataclass(frozen=True)
@@ -256,14 +261,6 @@ def _weights(moments: Moments, rss: FloatArray, model: HarmonicModel) -> FloatAr
     """One over each channel's residual variance; 0 for a channel that is constant."""
     noise = np.maximum(rss, RELATIVE_FLOOR * moments.power) / (moments.count - model.size)
     return np.divide(1.0, noise, out=np.zeros_like(noise), where=noise > 0)
-
-
-MAX_STEPS = 30
-"""Gauss-Newton steps; from a periodogram's peak three to five are enough."""
-
-LINEAR = 1e-7
-"""A step of omega that turns the record's ends by less than this [rad] is the last: amplitudes go
-on linearly with it, and what is neglected, a share of its square, is rounding."""
 
 
 @dataclass(frozen=True)

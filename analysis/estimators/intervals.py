@@ -40,6 +40,20 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from ..results.estimate import Estimate, Interval
 from .spectrum import ResidualBins
 
+EQUIVALENT_GAIN = 0.02
+EQUIVALENT_LAG_RAD = np.pi / 180
+"""Default margins: 2 % in gain, 1 degree in lag."""
+
+CONFIDENCE = 0.95
+TAILS = ((1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2)
+"""Quantiles at the ends of an interval."""
+
+DRAWS = 400
+
+_MOST_STEPS = 60
+_EXACT = 1e-12
+_TINY = 1e-300
+
 
 @dataclass(frozen=True)
 class ResponseErrors:
@@ -111,11 +125,6 @@ def response_errors(
     return ResponseErrors(parts[0] - parts[1], rounding, turn, alone)
 
 
-EQUIVALENT_GAIN = 0.02
-EQUIVALENT_LAG_RAD = np.pi / 180
-"""Default margins: 2 % in gain, 1 degree in lag."""
-
-
 def equivalence_p(
     deviation: FloatArray, error: FloatArray, dof: FloatArray | float, margin: float
 ) -> float:
@@ -151,11 +160,6 @@ def holm(p: FloatArray) -> FloatArray:
     return adjusted
 
 
-CONFIDENCE = 0.95
-TAILS = ((1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2)
-"""Quantiles at the ends of an interval."""
-
-
 def welch_satterthwaite(variances: FloatArray, dof: FloatArray) -> FloatArray:
     """Return the degrees of freedom of a sum of estimated variances (Welch, Biometrika 34, 1947).
 
@@ -179,9 +183,6 @@ def t_factor(dof: float) -> float:
 def around(value: float, half: float) -> Interval:
     """Return the interval of a value with a half width."""
     return value - half, value + half
-
-
-DRAWS = 400
 
 
 @dataclass(frozen=True)
@@ -269,11 +270,6 @@ def _norm(
     squared = float(np.linalg.norm(value)) ** 2 - float(np.mean(sizes**2))
     # Two norms share the 5 %.
     return max(0.0, squared) ** 0.5, float(np.quantile(sizes, 1 - (1 - CONFIDENCE) / 2))
-
-
-_MOST_STEPS = 60
-_EXACT = 1e-12
-_TINY = 1e-300
 
 
 def mixture_interval(

@@ -30,6 +30,12 @@ from ..session.runs import Role
 from .pooling import PooledResponse
 from .reversal import SIGNIFICANT
 
+_ROUTES = {
+    Route.TORQUE: "Z from torques",
+    Route.SERVO: "Z from H and the servo's parameters",
+    Route.ROW_SCALED: "H^-1, which is Z up to a factor for each row",
+}
+
 
 def kick_answer(coupling: Coupling) -> str:
     """Answer from the coupling.
@@ -165,13 +171,6 @@ def _worst(rows: tuple[RowCheck, ...]) -> str:
     off = _off(worst)
     digits = 1 - math.floor(math.log10(max(off, worst.standard_error, 1e-6)))
     return f"{off:.{digits}f} ({worst.name}, standard error {worst.standard_error:.{digits}f})"
-
-
-_ROUTES = {
-    Route.TORQUE: "Z from torques",
-    Route.SERVO: "Z from H and the servo's parameters",
-    Route.ROW_SCALED: "H^-1, which is Z up to a factor for each row",
-}
 
 
 def sweep_answer(coupling: Coupling) -> str:

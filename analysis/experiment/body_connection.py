@@ -32,6 +32,14 @@ SPEED_IN_MODEL = 1.5 * SAME_SPEED
 _VELOCITIES = ("forward", "left", "turn")
 _PHASES: FloatArray = 2 * np.pi * np.arange(24) / 24
 
+CONNECTION_METHOD = (
+    "velocity of the body xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B "
+    "Fourier series in the gait's phase, least squares over the mean cycles of all gaits; each "
+    "session predicted from its measured joint angles by a model of the others; intervals at 95 % "
+    "from what the gaits leave when left out (Student's t), none at another speed."
+)
+"""The method as one sentence, beginning in lower case."""
+
 
 @dataclass(frozen=True)
 class GaitSession:
@@ -213,12 +221,3 @@ def connection_detail(found: BodyConnection) -> list[str]:
             "the model."
         )
     return lines
-
-
-CONNECTION_METHOD = (
-    "velocity of the body xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B "
-    "Fourier series in the gait's phase, least squares over the mean cycles of all gaits; each "
-    "session predicted from its measured joint angles by a model of the others; intervals at 95 % "
-    "from what the gaits leave when left out (Student's t), none at another speed."
-)
-"""The method as one sentence, beginning in lower case."""

@@ -49,6 +49,9 @@ more counts as strong (:data:`.analysis.oscillators.laplacian.STRONG`)."""
 CURVED = 0.3
 """Second order over first order, from which the third may be a tenth of the first."""
 
+BETTER = 2.0
+"""P holds where it predicts so many times better than 'each joint keeps its H_i'."""
+
 
 def kick_size(
     kicks: Sequence[Kick | None], answers: ResponseMatrices, matrices: LocalMatrices
@@ -121,10 +124,6 @@ def _curvature(
         odd += float(np.sum(np.abs(high - low) ** 2)) / 4
         noise += variance * (0.25 / len(up) + 0.25 / len(down) + 1 / len(base))
     return (max(0.0, even - noise) / odd) ** 0.5 if odd > 0 else 0.0
-
-
-BETTER = 2.0
-"""P holds where it predicts so many times better than 'each joint keeps its H_i'."""
 
 
 def predict(

@@ -52,6 +52,17 @@ from ..results.estimate import Estimate
 from .kick_runs import Kick, Kind
 from .run_scatter import RunErrors, run_errors, sides
 
+BANDS = (1, 2, 3)
+
+UNKNOWN_SHAPE = (Estimate(), Estimate(), Estimate(), Estimate())
+"""Asymmetry and bands of a matrix that can't be inverted."""
+
+SINGULAR = 1e10
+"""Condition number beyond which H isn't inverted."""
+
+ROW_TOLERANCE = 1e-2
+"""Central differences of 0.05 leave curvature of third order in a row's sum."""
+
 
 @dataclass(frozen=True)
 class ResponseMatrices:
@@ -187,15 +198,6 @@ def stacked(blocks: Sequence[Sequence[NoisyMatrix]], correlation: FloatArray | N
     return NoisyMatrix(block("value"), block("error"), block("dof"), correlation)
 
 
-BANDS = (1, 2, 3)
-
-UNKNOWN_SHAPE = (Estimate(), Estimate(), Estimate(), Estimate())
-"""Asymmetry and bands of a matrix that can't be inverted."""
-
-SINGULAR = 1e10
-"""Condition number beyond which H isn't inverted."""
-
-
 def lti_reading(
     P: NoisyMatrix,
     R: NoisyMatrix,
@@ -267,10 +269,6 @@ def squared(share: Estimate) -> Estimate:
         return share
     value, *ends = (min(1.0, one**2) for one in (share.value, *(share.ci95 or ())))
     return Estimate(value, (ends[0], ends[1]) if ends else None)
-
-
-ROW_TOLERANCE = 1e-2
-"""Central differences of 0.05 leave curvature of third order in a row's sum."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,18 @@ LONGEST_PERIOD_S = 1e4
 
 Inputs = Literal["same", "orthogonal"]
 
+HIGHEST = 0.25
+"""Share of the sampling rate up to which lines are estimated: beyond it splines are not exact."""
+
+LEAST_LINES = 4
+"""Lines from which commands without a plan are a multisine."""
+
+_MOST_PERIODS = 64
+_STEPS = 16  # of a period, by which its end is moved
+_LONG_GAP = 0.02  # of a period
+_LEAST_LINE = 0.05  # of the median of the lines' amplitudes
+_SAME_LINES_S = 1e-6  # relative
+
 
 @dataclass(frozen=True)
 class MultisineDesign:
@@ -104,19 +116,6 @@ def planned_design(record: Mapping[str, str], where: str) -> MultisineDesign | N
         realisation=int(number("realisation", 0, 1e6)),
         inputs="same" if inputs == "same" else "orthogonal",
     )
-
-
-HIGHEST = 0.25
-"""Share of the sampling rate up to which lines are estimated: beyond it splines are not exact."""
-
-LEAST_LINES = 4
-"""Lines from which commands without a plan are a multisine."""
-
-_MOST_PERIODS = 64
-_STEPS = 16  # of a period, by which its end is moved
-_LONG_GAP = 0.02  # of a period
-_LEAST_LINE = 0.05  # of the median of the lines' amplitudes
-_SAME_LINES_S = 1e-6  # relative
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,13 @@ LEAST_LEANS = 3
 
 RESAMPLES = 2_000
 
+SIGNIFICANT = 0.05
+"""Family-wise level of the whole result: one family of the contrasts and the common parts of all
+pairs, gain and lag, gives the p of H1 and that of each pair."""
+
+SAME_HEADING_RAD = 0.2
+"""Headings that differ by no more are the same [rad]: 2 % of a tilt along the body is left."""
+
 
 def tilt_check(
     forward: ComplexArray,
@@ -277,14 +284,6 @@ def _percentiles(values: FloatArray) -> Interval:
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(values, [tail, 100 - tail])
     return float(low), float(high)
-
-
-SIGNIFICANT = 0.05
-"""Family-wise level of the whole result: one family of the contrasts and the common parts of all
-pairs, gain and lag, gives the p of H1 and that of each pair."""
-
-SAME_HEADING_RAD = 0.2
-"""Headings that differ by no more are the same [rad]: 2 % of a tilt along the body is left."""
 
 
 def reversal_of(

@@ -44,6 +44,15 @@ from .local_coupling import SINGULAR, UNKNOWN_SHAPE, reciprocity
 from .sweep_runs import CommandTones, Sweep, SweepData, sweep_data
 from .tones import Phasors, distortion, sideband_energy
 
+NONLINEAR = 0.01
+"""Distortion of a tone above which a chain isn't called linear."""
+
+_VALIDITY = {
+    False: "without contact: the linear chain, at these frequencies, at any small amplitude",
+    None: "only if the robot touched nothing, which its sessions don't record",
+    True: "in contact: what a linear chain explains best of these very motions, no more",
+}
+
 
 @dataclass(frozen=True)
 class MeasuredMatrix:
@@ -177,16 +186,6 @@ def _dof(variance: FloatArray, dof: FloatArray, power: FloatArray) -> FloatArray
     """Return the degrees of freedom of sum_k variance_ik power_kj, shape (m, m)."""
     parts = variance.T[:, :, None] * power[:, None, :]
     return welch_satterthwaite(parts, np.broadcast_to(dof.T[:, :, None], parts.shape))
-
-
-NONLINEAR = 0.01
-"""Distortion of a tone above which a chain isn't called linear."""
-
-_VALIDITY = {
-    False: "without contact: the linear chain, at these frequencies, at any small amplitude",
-    None: "only if the robot touched nothing, which its sessions don't record",
-    True: "in contact: what a linear chain explains best of these very motions, no more",
-}
 
 
 def sweep_coupling(

@@ -42,6 +42,14 @@ _ALIKE = 1.5
 
 _ORTHOGONAL = 0.1
 
+_PERIODS = 1.5
+"""Periods of a multisine in a record from which lines beside its tones are resolved."""
+
+_MOST_LINES = 60
+
+_CHANCE_OF_DRIFT = 5e-3
+"""Chance of a warning about a settled run."""
+
 
 @dataclass(frozen=True)
 class CommandTones:
@@ -173,12 +181,6 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
     return Sweep(tuple(index), runs[0].names, tuple(apart), lines, lacking=m - r)
 
 
-_PERIODS = 1.5
-"""Periods of a multisine in a record from which lines beside its tones are resolved."""
-
-_MOST_LINES = 60
-
-
 @dataclass(frozen=True)
 class SweepData:
     """What r runs of m joints gave at L tones.
@@ -301,10 +303,6 @@ def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ..
         )
         for k in lines
     )
-
-
-_CHANCE_OF_DRIFT = 5e-3
-"""Chance of a warning about a settled run."""
 
 
 def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int) -> float:

@@ -37,6 +37,27 @@ from .local_coupling import squared
 
 _NEAREST = 6
 
+MOST_TONES = 12
+EXPLAINED = 0.98
+"""Share of the variance that the tones must explain."""
+
+FAINT = 0.005
+"""A line below this share of the strongest is no tone."""
+
+MOST_MULTIPLE = 24
+"""Largest multiple of the tones' common step that the lowest of them may be."""
+
+MULTIPLE = 1e-3
+"""How near to a whole number a ratio of frequencies must be to count as one."""
+
+_SCOUTS = 4
+_MOST_SAMPLES = 8192
+_MOST_GAPS = 8  # of an even grid over the samples, as a multiple of these: no clock that jumped
+_STEPS = 4
+
+_REACH = 16
+"""Bins to either side that are looked at."""
+
 
 @dataclass(frozen=True)
 class Phasors:
@@ -107,25 +128,6 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
 def _joined(parts: tuple[Phasors, ...]) -> Phasors:
     columns = zip(*((one.value, one.variance, one.dof) for one in parts), strict=True)
     return Phasors(*(np.concatenate(one, axis=1) for one in columns))
-
-
-MOST_TONES = 12
-EXPLAINED = 0.98
-"""Share of the variance that the tones must explain."""
-
-FAINT = 0.005
-"""A line below this share of the strongest is no tone."""
-
-MOST_MULTIPLE = 24
-"""Largest multiple of the tones' common step that the lowest of them may be."""
-
-MULTIPLE = 1e-3
-"""How near to a whole number a ratio of frequencies must be to count as one."""
-
-_SCOUTS = 4
-_MOST_SAMPLES = 8192
-_MOST_GAPS = 8  # of an even grid over the samples, as a multiple of these: no clock that jumped
-_STEPS = 4
 
 
 def find_tones(commands: Sequence[Series]) -> FloatArray | None:
@@ -239,10 +241,6 @@ def _refine(
     limit = np.pi / (2 * _span(scouts))
     step: FloatArray = np.linalg.lstsq(normal, right, rcond=None)[0].astype(np.float64)
     return np.clip(step, -limit, limit), np.stack(sizes), left
-
-
-_REACH = 16
-"""Bins to either side that are looked at."""
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,27 @@ BEYOND_NOISE = 8.0
 
 _SIGMA_OF_MAD = 1.4826
 
+MOST_CONDITION = 500.0
+"""Condition number beyond which couplings are refused: random kicks of up to 1 rad every 5 s give
+40 to 200, of up to 0.3 rad 500 to 2000, locked phases without noise more than 1e6."""
+
+MOST_NOISE = 0.5
+"""Standard errors beyond this share of the couplings, both root mean square, are refused: noise
+alone moves locked phases too, but so little that only its size can be estimated."""
+
+RECORD = (
+    "the chain kicked as it runs: each phase turned at once by random amounts up to 1 rad, every "
+    "few seconds, for a minute (kick_every_s = 5, kick_size = 1 in the scenario's gait)"
+)
+
+_ADAPTIVE = {
+    "steer": "steering",
+    "shrink": "amplitudes by obstacles beside it",
+    "haste": "frequency by an obstacle behind it",
+    "course": "course",
+}
+"""First parts of the names on ``/gait`` that only a controller logs."""
+
 
 def kicked_steps(phases: FloatArray) -> BoolArray:
     """Find the steps from sample to sample that hold a kick.
@@ -76,20 +97,6 @@ def between_kicks(
         for i, j in pairwise(bounds)
         if j - i > 1
     )
-
-
-MOST_CONDITION = 500.0
-"""Condition number beyond which couplings are refused: random kicks of up to 1 rad every 5 s give
-40 to 200, of up to 0.3 rad 500 to 2000, locked phases without noise more than 1e6."""
-
-MOST_NOISE = 0.5
-"""Standard errors beyond this share of the couplings, both root mean square, are refused: noise
-alone moves locked phases too, but so little that only its size can be estimated."""
-
-RECORD = (
-    "the chain kicked as it runs: each phase turned at once by random amounts up to 1 rad, every "
-    "few seconds, for a minute (kick_every_s = 5, kick_size = 1 in the scenario's gait)"
-)
 
 
 def chain_coupling(
@@ -229,15 +236,6 @@ def session_couplings(
         )
         for log in read_phases(session, start_ns, stop_ns)
     )
-
-
-_ADAPTIVE = {
-    "steer": "steering",
-    "shrink": "amplitudes by obstacles beside it",
-    "haste": "frequency by an obstacle behind it",
-    "course": "course",
-}
-"""First parts of the names on ``/gait`` that only a controller logs."""
 
 
 def closed_loop(

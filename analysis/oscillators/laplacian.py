@@ -41,6 +41,12 @@ from ..results.oscillators import Levels
 STRONG = 0.1
 """A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""
 
+POINTS = 41
+"""Of the grid, each way."""
+
+MARGIN = 0.1
+"""Of the grid around the eigenvalues."""
+
 
 @dataclass(frozen=True)
 class Spectrum:
@@ -171,13 +177,6 @@ def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
 def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
     """Return basic bootstrap intervals, shape (..., 2)."""
     return np.stack([2.0 * value - end for end in np.quantile(draws, TAILS[::-1], axis=0)], axis=-1)
-
-
-POINTS = 41
-"""Of the grid, each way."""
-
-MARGIN = 0.1
-"""Of the grid around the eigenvalues."""
 
 
 def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> FloatArray:

@@ -50,6 +50,18 @@ from ..results.oscillators import (
 )
 from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals_of, pseudospectrum, spectrum
 
+MOST_CONDITION = 1e6
+"""Condition number of P beyond which it isn't inverted."""
+
+MOST_EXPLICIT = 1e6
+"""Explicit coupling beyond which no answer is looked for [eps]."""
+
+EXPLICIT_DRAWS = 100
+"""Draws of P for the interval of the explicit coupling, each a root to find."""
+
+_MOST_DOF = 1e6
+"""Student's t is a normal distribution by then."""
+
 
 def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:
     """Return the response as the generator receives it.
@@ -80,10 +92,6 @@ def relaxation(P: FloatArray, R: FloatArray, felt: ComplexArray) -> FloatArray:
     return felt.real[..., None] * off + felt.imag[..., None] * R
 
 
-MOST_CONDITION = 1e6
-"""Condition number of P beyond which it isn't inverted."""
-
-
 def entrainment(P: NoisyMatrix) -> RelativeCoupling:
     """Read P as the matrix of an entrained chain.
 
@@ -109,10 +117,6 @@ def entrainment(P: NoisyMatrix) -> RelativeCoupling:
     half = np.asarray(stdtrit(dof, 0.5 + CONFIDENCE / 2) * np.sqrt(variance), dtype=np.float64)
     relative = inverse - np.eye(len(P.value))
     return RelativeCoupling(ENTRAINMENT_LABEL, rows_of(relative), rows_of(half), finite)
-
-
-MOST_EXPLICIT = 1e6
-"""Explicit coupling beyond which no answer is looked for [eps]."""
 
 
 def homogeneous(P: FloatArray) -> FloatArray:
@@ -171,13 +175,6 @@ def explicit_coupling(P: FloatArray, rate: float = STRONG) -> float | None:
         if enough > MOST_EXPLICIT:
             return None
     return float(brentq(lacking, 0.0, enough, xtol=1e-6))
-
-
-EXPLICIT_DRAWS = 100
-"""Draws of P for the interval of the explicit coupling, each a root to find."""
-
-_MOST_DOF = 1e6
-"""Student's t is a normal distribution by then."""
 
 
 def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:

@@ -45,6 +45,15 @@ _SAME = 1e-6
 _JITTER = 0.5
 """A step that is off by this share of a period, or more, is a gap."""
 
+WINDOW_S = 0.1
+"""Length of a test function: short beside 1/K, long beside the noise of a reading."""
+
+LEAST_SAMPLES = 4
+"""Sampling periods in a window, at least."""
+
+SINGULAR = 1e7
+"""Condition number beyond which nothing is solved: Z'X has its square."""
+
 
 @dataclass(frozen=True)
 class PhaseLog:
@@ -175,16 +184,6 @@ def _angles(session: SessionView) -> JointSignals | None:
         return session.joints(RESPONSE_TOPIC)
     except MissingChannelError:
         return None
-
-
-WINDOW_S = 0.1
-"""Length of a test function: short beside 1/K, long beside the noise of a reading."""
-
-LEAST_SAMPLES = 4
-"""Sampling periods in a window, at least."""
-
-SINGULAR = 1e7
-"""Condition number beyond which nothing is solved: Z'X has its square."""
 
 
 @dataclass(frozen=True)

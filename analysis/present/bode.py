@@ -35,6 +35,19 @@ JOINTS = len(MARKERS)
 _TICKS = (1.0, 2.0, 5.0)
 ticker: Any = matplotlib.ticker  # its stubs lack the classes
 
+_BEST = (
+    " Dashed: standard deviation that nonlinear distortion gives to the gain of one realisation, "
+    "where there is any; dotted: standard deviation by noise of the mean of all realisations."
+)
+
+MOST_COLUMNS = 150
+"""Columns of a map; more cycles are averaged, with a note."""
+
+WIDTH = 960.0
+"""One unit is a pixel of a wide page."""
+
+_RIGHT = 8.0
+
 
 def bode(found: Sequence[JointFrequencyResponse], prefix: str) -> list[Drawing]:
     """Draw the responses, :data:`JOINTS` joints a figure.
@@ -112,12 +125,6 @@ def _figure(
     )
 
 
-_BEST = (
-    " Dashed: standard deviation that nonlinear distortion gives to the gain of one realisation, "
-    "where there is any; dotted: standard deviation by noise of the mean of all realisations."
-)
-
-
 def _tips(one: JointFrequencyResponse, lines: Iterable[int], *, lag: bool) -> list[str]:
     """Return the text of each line of a response, with its interval."""
     texts: list[str] = []
@@ -148,15 +155,6 @@ def _bode_in_words(group: Sequence[JointFrequencyResponse]) -> str:
         f"{math.degrees(one.lag_rad[0]):.3g}° and {math.degrees(one.lag_rad[-1]):.3g}°"
         for one in group
     )
-
-
-MOST_COLUMNS = 150
-"""Columns of a map; more cycles are averaged, with a note."""
-
-WIDTH = 960.0
-"""One unit is a pixel of a wide page."""
-
-_RIGHT = 8.0
 
 
 @dataclass(frozen=True)

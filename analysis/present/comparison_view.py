@@ -47,6 +47,22 @@ from .svg import (
 )
 from .text_experiment import comparison_method
 
+_MOST_WAVES = 4
+"""Joints drawn: those whose cycles differ most."""
+
+_VERDICTS = {
+    "different": "different",
+    "small": "different, but within the margins",
+    "same": "the same within the margins",
+    "open": "open",
+}
+
+_DATES: Any = matplotlib.dates  # whose annotations leave arguments unknown
+_MOST_FIGURES = 6
+
+_SPREADS = {"lag": (math.degrees(1), "°"), "offset": (math.degrees(1), "°"), "delay": (1e3, " ms")}
+"""Factor and unit of quantities that are no ratios."""
+
 
 class Panel(NamedTuple):
     """One quantity: its label with unit, the joints' values in that unit, and its margin."""
@@ -101,10 +117,6 @@ def _panel(axes: Axes, panel: Panel, names: Sequence[str], colors: Sequence[str]
     return tooltips
 
 
-_MOST_WAVES = 4
-"""Joints drawn: those whose cycles differ most."""
-
-
 def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
     """Draw the mean cycles that differ most: both sides on the left, B minus A on the right.
 
@@ -151,14 +163,6 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
         f"Mean cycle of the joints that differ most, by the phase of the {by}: A dashed, B in "
         "the joint's colour, and their difference with its 95 % interval at each phase.",
     )
-
-
-_VERDICTS = {
-    "different": "different",
-    "small": "different, but within the margins",
-    "same": "the same within the margins",
-    "open": "open",
-}
 
 
 def comparison_view(comparison: Comparison) -> dict[str, Any]:
@@ -253,10 +257,6 @@ def _facts(comparison: Comparison) -> list[Fact]:
     return facts
 
 
-_DATES: Any = matplotlib.dates  # whose annotations leave arguments unknown
-_MOST_FIGURES = 6
-
-
 def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> dict[str, Any]:
     """Return what the template shows of a fleet, by name.
 
@@ -288,10 +288,6 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
             for k, history in enumerate(fleet.robots)
         ],
     }
-
-
-_SPREADS = {"lag": (math.degrees(1), "°"), "offset": (math.degrees(1), "°"), "delay": (1e3, " ms")}
-"""Factor and unit of quantities that are no ratios."""
 
 
 def spread_text(quantity: str, value: float | None) -> str:

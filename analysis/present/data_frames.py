@@ -40,6 +40,8 @@ from ..results.oscillators import ChainCoupling, Link, Mode, Rate
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 
+SUFFIX = ".csv"
+
 
 def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.DataFrame:
     """Return dataclasses of one kind as a table.
@@ -291,9 +293,6 @@ def _pairs(names: Sequence[str]) -> dict[str, list[str]]:
 
 def _entries(name: str, rows: Sequence[Sequence[float]]) -> dict[str, list[float]]:
     return {name: np.asarray(rows, dtype=np.float64).ravel().tolist()}
-
-
-SUFFIX = ".csv"
 
 
 def joint_table(sessions: Sequence[Analysis]) -> pd.DataFrame:

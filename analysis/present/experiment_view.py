@@ -52,6 +52,16 @@ from .text_experiment import (
 AGREE = 0.1
 """Largest relative difference of Z from torques and Z from the described servos that agree."""
 
+_NUMBERS = re.compile(r"[-+]?\d[\d.e-]*")
+_BOUND = "no joint differs more from its mirror, 95 %"
+
+_ASIDE = 0.16
+"""Distance of the dots of single runs from their joint's position."""
+
+_SOLID: dict[str, Any] = {"markersize": 4.6, "markeredgecolor": INK, "markeredgewidth": 0.5}
+_HOLLOW = _SOLID | {"markersize": 6.6, "markerfacecolor": "none", "markeredgewidth": 1.0}
+_MIRRORED: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 2))}
+
 
 def _sweep_facts(coupling: LinearCoupling) -> list[Fact]:
     """Return the key figures at the first tone."""
@@ -105,10 +115,6 @@ def _linear(coupling: LinearCoupling) -> Trial:
     worst = max(known)
     verdict = "yes" if worst <= NONLINEAR else "no: take a smaller amplitude"
     return Trial(question, f"largest distortion {digits(100 * worst)} %", None, verdict)
-
-
-_NUMBERS = re.compile(r"[-+]?\d[\d.e-]*")
-_BOUND = "no joint differs more from its mirror, 95 %"
 
 
 def experiment_view(experiment: Experiment) -> dict[str, Any]:
@@ -266,14 +272,6 @@ def _kick_facts(coupling: LocalCoupling) -> list[Fact]:
         Fact("Within one joint", formats.percent(lti.within_1), "of X's off-diagonal energy"),
         Fact("Valid to", valid, f"{len(coupling.held_out)} held-out runs"),
     ]
-
-
-_ASIDE = 0.16
-"""Distance of the dots of single runs from their joint's position."""
-
-_SOLID: dict[str, Any] = {"markersize": 4.6, "markeredgecolor": INK, "markeredgewidth": 0.5}
-_HOLLOW = _SOLID | {"markersize": 6.6, "markerfacecolor": "none", "markeredgewidth": 1.0}
-_MIRRORED: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 2))}
 
 
 class Profiles(NamedTuple):

@@ -22,6 +22,14 @@ from ..results.formats import decimals_for_values, number, short
 from .page_tables import color_bar, element, joined, svg_element
 from .svg import Drawing
 
+PICTURE = 560.0
+"""Side of a picture, one unit is a pixel of a wide page."""
+
+MOST_IN_CELLS = 16
+"""Matrices up to this size have numbers in all cells; larger ones show those of a row."""
+
+_FEELS = "the joint that feels the torque"
+
 
 @dataclass(frozen=True)
 class Entries:
@@ -157,15 +165,6 @@ def _parts(
     if symbol.startswith("H"):
         words = {}
     return (replace(part, ends=ends, **words) for part in parts)
-
-
-PICTURE = 560.0
-"""Side of a picture, one unit is a pixel of a wide page."""
-
-MOST_IN_CELLS = 16
-"""Matrices up to this size have numbers in all cells; larger ones show those of a row."""
-
-_FEELS = "the joint that feels the torque"
 
 
 class _Box(NamedTuple):

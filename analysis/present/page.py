@@ -74,6 +74,29 @@ from .text import contact_lines, shape_lines
 LARGEST_BYTES = 3_000_000
 """A page must open on a phone."""
 
+VARIABLE = "UNDULOG_BROWSER"
+"""Environment variable that names the browser."""
+
+_NAMES = (
+    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
+    *("microsoft-edge", "microsoft-edge-stable", "msedge"),
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
+)
+
+LONGEST_S = 120.0
+"""After which a browser is ended [s]."""
+
+_FLAGS = (
+    *("--headless", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
+    *("--no-default-browser-check", "--disable-extensions", "--disable-default-apps"),
+    # No network: neither by the page, whose policy forbids it, nor by the browser itself.
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--disable-domain-reliability", "--disable-features=NetworkTimeServiceQuerying,MediaRouter"),
+    *("--host-resolver-rules=MAP * ~NOTFOUND", "--proxy-server=127.0.0.1:9"),  # port 9: discard
+    *("--no-pdf-header-footer", "--generate-pdf-document-outline"),
+)
+
 
 def render(
     result: Analysis | Experiment | Comparison,
@@ -303,30 +326,6 @@ class SessionsPage:
         view = session_view(analysis, session, cycles, at)
         template = environment().get_template("session_part.html.j2")
         return template.render(v=view, at=at, top=2, left_out=self._left_out)
-
-
-VARIABLE = "UNDULOG_BROWSER"
-"""Environment variable that names the browser."""
-
-_NAMES = (
-    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
-    *("microsoft-edge", "microsoft-edge-stable", "msedge"),
-    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
-)
-
-LONGEST_S = 120.0
-"""After which a browser is ended [s]."""
-
-_FLAGS = (
-    *("--headless", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
-    *("--no-default-browser-check", "--disable-extensions", "--disable-default-apps"),
-    # No network: neither by the page, whose policy forbids it, nor by the browser itself.
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--disable-domain-reliability", "--disable-features=NetworkTimeServiceQuerying,MediaRouter"),
-    *("--host-resolver-rules=MAP * ~NOTFOUND", "--proxy-server=127.0.0.1:9"),  # port 9: discard
-    *("--no-pdf-header-footer", "--generate-pdf-document-outline"),
-)
 
 
 def find_browser(given: str | None = None) -> str:

@@ -24,6 +24,31 @@ from .tables import PAGE, Cell, Ends, PValue, Quantity, Table
 STILL_RAD = 1e-6
 """A command with less amplitude than this holds its joint still [rad]."""
 
+LEVELS = 48
+"""Steps of a colour scale."""
+
+NO_BREAK = "\N{NO-BREAK SPACE}"
+
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|Hz|J|s|rad|mm|N m|kB)(?![\w]))")
+_INTERVAL = re.compile(r"\[[^]]*\]")
+_P = re.compile(r"\bp ([<=]) ")
+_INVERSE = "\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE}"
+
+_NOT_COMPUTED = Markup(
+    '<span class="null"><span aria-hidden="true">{}</span>'
+    '<span class="hidden">not computed</span></span>'
+).format(formats.MISSING)
+
+_CLASSES = {"number": ' class="n"', "sentence": ' class="say"', "word": "", "code": ""}
+
+LEVEL_NOTE = (
+    f"Each test stands by itself at a level of {100 * SIGNIFICANT:g} %; those that look at several "
+    "joints at once are family-wise over them. A question that could not be answered is open, not "
+    "answered with no."
+)
+
+_MARGINS = {"gain": "2 %", "lag": "1°"}
+
 
 def is_driven(joint: JointResult) -> bool:
     """Return whether a joint has a command that moves, even if its response is missing."""
@@ -73,10 +98,6 @@ def svg_element(
     )
 
 
-LEVELS = 48
-"""Steps of a colour scale."""
-
-
 def hue(level: int, *, signed: bool) -> dict[str, str]:
     """Return class and style of a colour.
 
@@ -107,14 +128,6 @@ def _value(value: object) -> str:
     return plain(str(value))
 
 
-NO_BREAK = "\N{NO-BREAK SPACE}"
-
-_UNIT = re.compile(r"(?<=\d) (?=(?:%|Hz|J|s|rad|mm|N m|kB)(?![\w]))")
-_INTERVAL = re.compile(r"\[[^]]*\]")
-_P = re.compile(r"\bp ([<=]) ")
-_INVERSE = "\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE}"
-
-
 def typeset(text: str) -> str:
     """Return text without line breaks between numbers and units, and with ``H^-1`` raised."""
     known = _UNIT.sub(NO_BREAK, plain(text).replace("^-1", _INVERSE))
@@ -137,12 +150,6 @@ def digits(value: float) -> str:
     return f"{value:.2g}".replace("-", formats.MINUS)
 
 
-_NOT_COMPUTED = Markup(
-    '<span class="null"><span aria-hidden="true">{}</span>'
-    '<span class="hidden">not computed</span></span>'
-).format(formats.MISSING)
-
-
 @dataclass(frozen=True)
 class Fact:
     """A key figure, with a note in small print, which may be empty."""
@@ -150,9 +157,6 @@ class Fact:
     name: str
     value: str
     note: str = ""
-
-
-_CLASSES = {"number": ' class="n"', "sentence": ' class="say"', "word": "", "code": ""}
 
 
 def grid(table: Table[Any], marks: Sequence[Markup] = ()) -> Markup:
@@ -287,16 +291,6 @@ def _analysed(analysis: Analysis) -> str:
     spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in windows[:3])
     more = f" and {len(windows) - 3} more" if len(windows) > 3 else ""
     return f"{cycles:.0f} cycles, {spans}{more}" if cycles else f"{spans}{more}"
-
-
-LEVEL_NOTE = (
-    f"Each test stands by itself at a level of {100 * SIGNIFICANT:g} %; those that look at several "
-    "joints at once are family-wise over them. A question that could not be answered is open, not "
-    "answered with no."
-)
-
-
-_MARGINS = {"gain": "2 %", "lag": "1°"}
 
 
 @dataclass(frozen=True)

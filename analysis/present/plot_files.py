@@ -35,6 +35,24 @@ _MPL: Any = mpl  # its annotations leave keyword arguments unknown
 _COLORS: Any = colors
 _PATCHES: Any = patches
 
+_PROPERTIES = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")
+
+_TO_LMS = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+_TO_LAB = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
+"""B. Ottosson, "A perceptual color space for image processing", 2020; W3C CSS Color 4."""
+
 
 def check_plots(folder: Path, kind: Format, *, force: bool) -> None:
     """Check the folder of figures before any work is done.
@@ -102,9 +120,6 @@ def save_plots(
             paper = paper_colors()["paper"]
             figure.savefig(part, format=kind, dpi=_DPI, facecolor=paper, metadata=nothing)
     return list(paths.values())
-
-
-_PROPERTIES = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")
 
 
 def _on_paper(color: str) -> str:
@@ -226,23 +241,6 @@ def _fill(element: ET.Element, classes: list[str]) -> Any:
     if "q" in classes:
         return _mixed(paper["high"], paper["low"], share)
     return _mixed(paper["plus" if "plus" in classes else "minus"], paper["paper"], share)
-
-
-_TO_LMS = np.array(
-    [
-        [0.4122214708, 0.5363325363, 0.0514459929],
-        [0.2119034982, 0.6806995451, 0.1073969566],
-        [0.0883024619, 0.2817188376, 0.6299787005],
-    ]
-)
-_TO_LAB = np.array(
-    [
-        [0.2104542553, 0.7936177850, -0.0040720468],
-        [1.9779984951, -2.4285922050, 0.4505937099],
-        [0.0259040371, 0.7827717662, -0.8086757660],
-    ]
-)
-"""B. Ottosson, "A perceptual color space for image processing", 2020; W3C CSS Color 4."""
 
 
 def _mixed(color: str, other: str, share: float) -> Any:

@@ -53,6 +53,12 @@ _KINDS: tuple[type[PresentedResult], ...] = (
     Coupling,
 )
 
+MOST_ROWS = 40
+"""Rows of a table that a notebook shows."""
+
+_ROOT = re.compile(r":root\s*\{([^}]*)\}")
+_VARIABLE = re.compile(r"--([\w-]+):\s*([^;]+);")
+
 
 def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
     """Write a result as JSON; see :meth:`.analysis.results.estimate.PresentedResult.save`."""
@@ -166,10 +172,6 @@ def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
     return chosen(**built)
 
 
-MOST_ROWS = 40
-"""Rows of a table that a notebook shows."""
-
-
 def headline(result: object) -> str:  # noqa: PLR0911 - one kind of result a case
     """Return the answer in one line, the first of :func:`text_of`.
 
@@ -245,10 +247,6 @@ def html(result: Any) -> str:
 
 def _readable(cell: object) -> object:
     return plain(cell) if isinstance(cell, str) else cell
-
-
-_ROOT = re.compile(r":root\s*\{([^}]*)\}")
-_VARIABLE = re.compile(r"--([\w-]+):\s*([^;]+);")
 
 
 @dataclass(frozen=True, repr=False)

@@ -42,6 +42,8 @@ _SOLID: dict[str, Any] = {"markersize": 5.2, "markeredgecolor": INK, "markeredge
 _HOLLOW: dict[str, Any] = {"markersize": 5.2, "markeredgewidth": 1.2, "markerfacecolor": PAPER}
 _PLANES = ("horizontal", "vertical", None)
 
+_NULL_STYLES = (DASHED, (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))
+
 
 @dataclass(frozen=True)
 class _Shown:
@@ -259,9 +261,6 @@ def _segments_caption(joints: Sequence[JointResult], lags: _Shown) -> str:
             "body."
         )
     return text
-
-
-_NULL_STYLES = (DASHED, (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))
 
 
 def body_motion(body: BodyResult, prefix: str) -> Drawing:

@@ -38,6 +38,18 @@ SECONDS_WITHOUT_GAIT = 5.0
 MOST_POINTS = 600
 """Samples drawn a line; more would only add bytes, a figure is about 900 pixels wide."""
 
+MOST_SPANS = 4
+"""Stretches that a row lists; more are counted."""
+
+WHAT = {
+    "sensor": "the sensor, not mechanics",
+    "sensor or joint": "the sensor or the joint itself",
+    "sensor or limit": "the sensor or a limit of the servo",
+    "limit": "a limit of the robot",
+    "record": "the record, not mechanics",
+}
+"""Text for each source of artefacts."""
+
 
 @dataclass(frozen=True)
 class Trace:
@@ -163,19 +175,6 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
 def _panel_title(joint: JointResult) -> str:
     values = f": gain {estimate(joint.gain)}, lag {estimate(degrees(joint.lag_rad), '°')}"
     return short(joint.name) + ("" if joint.gain.value is None else values)
-
-
-MOST_SPANS = 4
-"""Stretches that a row lists; more are counted."""
-
-WHAT = {
-    "sensor": "the sensor, not mechanics",
-    "sensor or joint": "the sensor or the joint itself",
-    "sensor or limit": "the sensor or a limit of the servo",
-    "limit": "a limit of the robot",
-    "record": "the record, not mechanics",
-}
-"""Text for each source of artefacts."""
 
 
 @dataclass(frozen=True)

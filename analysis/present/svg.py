@@ -117,6 +117,12 @@ _ANCHOR = re.compile(r"text-anchor: (\w+)")
 _TICK = re.compile(r"([xy])tick_")
 _FILL = re.compile(r"(?:^|; ?)fill: ([^;]+)")
 
+DASHED = (0, (5, 3))
+"""Line style of margins, means and nulls."""
+
+COMMAND: dict[str, Any] = {"color": REFERENCE, "linewidth": 2.4, "linestyle": (0, (2.2, 0.9))}
+"""Line behind that of a joint, whose colour some readers can't tell from grey."""
+
 
 @contextmanager
 def drawing(height_in: float, width_in: float = WIDTH_IN) -> Generator[Figure]:
@@ -299,13 +305,6 @@ def _plain_text_style(text: ET.Element) -> None:
     text.set("style", f"fill: {fill[1] if fill is not None else INK}")
     if text.get("transform", "").startswith("rotate(-0 "):
         del text.attrib["transform"]
-
-
-DASHED = (0, (5, 3))
-"""Line style of margins, means and nulls."""
-
-COMMAND: dict[str, Any] = {"color": REFERENCE, "linewidth": 2.4, "linestyle": (0, (2.2, 0.9))}
-"""Line behind that of a joint, whose colour some readers can't tell from grey."""
 
 
 @dataclass(frozen=True)

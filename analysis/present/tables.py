@@ -45,6 +45,11 @@ _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | No
 )
 """Name, note and value of each energy, and when a narrow terminal goes without; None: page only."""
 
+_NAMED = {
+    True: (("gain", "gain, B over A"), ("lag", "lag, B minus A")),
+    False: (("amplitude", "amplitude, B over A"), ("phase_lag", "phase lag, B minus A")),
+}
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -334,12 +339,6 @@ def _side(one: Difference, value: float) -> str:
 def _difference(one: Difference) -> Quantity:
     quantity, unit = in_people_units(one)
     return Quantity(quantity, formats.decimals_for([quantity], most=decimals_of(one)), unit)
-
-
-_NAMED = {
-    True: (("gain", "gain, B over A"), ("lag", "lag, B minus A")),
-    False: (("amplitude", "amplitude, B over A"), ("phase_lag", "phase lag, B minus A")),
-}
 
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:

@@ -46,6 +46,9 @@ _SPANS = 3
 _LIFTED = 0.9
 """Where links are on the ground for more of a cycle, on the mean, nothing is lifted."""
 
+_PART = 0.5
+"""Joints with this share of a pattern's largest are named."""
+
 
 def more_lines(analysis: Analysis) -> Iterator[str]:
     """Yield the lines of text after the tables."""
@@ -301,10 +304,6 @@ def _method(analysis: Analysis) -> str:
         "95 % intervals from the residual's spectrum beside it, Student's t; "
         f"lag positive = response late; energies over {cycles:.0f} whole cycles, {spans}."
     )
-
-
-_PART = 0.5
-"""Joints with this share of a pattern's largest are named."""
 
 
 def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False) -> str:

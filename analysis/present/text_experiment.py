@@ -33,6 +33,18 @@ from .tables import (
 )
 from .text import Sheet, body_detail, unidentified
 
+MOST_CHANGES = 12
+"""Lines of what was changed; the rest is in the JSON."""
+
+_DESIGNS = {
+    "sessions": "one session a side, errors from each session's own noise (Welch-Satterthwaite)",
+    "groups": "independent runs, errors from their scatter (Welch)",
+    "pairs": "paired runs, errors from the scatter of their differences",
+}
+
+_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
+"""Beginnings of warnings that every run of a multisine has, since it is no gait."""
+
 
 def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint]:
     """Return best linear approximations in short: band, bandwidth, delay, noise, distortion."""
@@ -75,16 +87,6 @@ def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint
         "even [%]": "the same at even lines",
     }
     return Table(columns, found, about=about)
-
-
-MOST_CHANGES = 12
-"""Lines of what was changed; the rest is in the JSON."""
-
-_DESIGNS = {
-    "sessions": "one session a side, errors from each session's own noise (Welch-Satterthwaite)",
-    "groups": "independent runs, errors from their scatter (Welch)",
-    "pairs": "paired runs, errors from the scatter of their differences",
-}
 
 
 def render_comparison(
@@ -142,10 +144,6 @@ def comparison_method(comparison: Comparison) -> str:
         "intervals hold together at 95 % after Bonferroni; the same within margins: two one-sided "
         "tests (TOST), each claim by itself at 5 %."
     )
-
-
-_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
-"""Beginnings of warnings that every run of a multisine has, since it is no gait."""
 
 
 def render_experiment(

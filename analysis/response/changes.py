@@ -50,6 +50,10 @@ _ROUNDING = 1e-9  # of an amplitude
 _DEGREES = (2, 3, 4)
 _BLOCK = 1 << 20  # samples that are looked at together
 
+_BESIDE = (1.5, 2.5)  # times the gait frequency, where noise within a cycle is read
+_POWER = float(np.log(_BESIDE[0]) / np.log(_BESIDE[1] / _BESIDE[0]))
+_SPREAD = (1 + _POWER) ** 2 + _POWER**2  # of the logarithm, times the number of cycles
+
 
 @dataclass(frozen=True)
 class Cycles:
@@ -336,10 +340,7 @@ def _kept(beside: float) -> float:
     return 1.0 - float(np.sum(np.abs(taken) ** 2)) / 512
 
 
-_BESIDE = (1.5, 2.5)  # times the gait frequency, where noise within a cycle is read
 _KEPT = tuple(_kept(one) for one in _BESIDE)
-_POWER = float(np.log(_BESIDE[0]) / np.log(_BESIDE[1] / _BESIDE[0]))
-_SPREAD = (1 + _POWER) ** 2 + _POWER**2  # of the logarithm, times the number of cycles
 
 
 def _amplitude_drift(cycles: Cycles) -> Estimate | None:

@@ -50,6 +50,37 @@ _SAME = 0.1
 _SIGMAS = 5.0
 """And so are those closer than this many standard errors."""
 
+RESOLUTION = 1.5
+"""Frequencies closer than this many cycles over the record are not resolved."""
+
+COINCIDENT = 0.5
+"""Harmonics of two groups closer than this many cycles over the record are one column."""
+
+MIXING_ORDER = 6
+"""Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
+
+MODELLED_ORDER = 11
+"""Highest |m| + |n| of a mixed tone that is looked for beside a group's tone."""
+
+_FAR = 30.0
+"""Cycles over the record from a group's tone beyond which a tone hardly reaches its noise."""
+
+_APART = 0.75
+"""Mixed tones closer to another line than this many cycles over the record are left out."""
+
+_ORTHOGONAL = 1.0
+"""Mixed tones closer to the group's own than this many cycles over the record are part of it: tones
+whole cycles apart are orthogonal, and up to 1.5 apart a line costs 5 % of the variance."""
+
+_MOST_MIXED = 24
+"""Mixed tones that are fitted at most, the strongest first."""
+
+_CHANCE = 1e-3
+"""Chance of fitting a mixed tone that is none, for each group."""
+
+_SAMPLES_PER_LINE = 8
+"""Samples that a channel needs for each line beside the group's harmonics."""
+
 
 @dataclass(frozen=True)
 class Unresolved:
@@ -226,38 +257,6 @@ def _with_compound(
         else:
             result.append(Rhythm(tuple(one.name for one in members), fit))
     return result
-
-
-RESOLUTION = 1.5
-"""Frequencies closer than this many cycles over the record are not resolved."""
-
-COINCIDENT = 0.5
-"""Harmonics of two groups closer than this many cycles over the record are one column."""
-
-MIXING_ORDER = 6
-"""Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
-
-MODELLED_ORDER = 11
-"""Highest |m| + |n| of a mixed tone that is looked for beside a group's tone."""
-
-_FAR = 30.0
-"""Cycles over the record from a group's tone beyond which a tone hardly reaches its noise."""
-
-_APART = 0.75
-"""Mixed tones closer to another line than this many cycles over the record are left out."""
-
-_ORTHOGONAL = 1.0
-"""Mixed tones closer to the group's own than this many cycles over the record are part of it: tones
-whole cycles apart are orthogonal, and up to 1.5 apart a line costs 5 % of the variance."""
-
-_MOST_MIXED = 24
-"""Mixed tones that are fitted at most, the strongest first."""
-
-_CHANCE = 1e-3
-"""Chance of fitting a mixed tone that is none, for each group."""
-
-_SAMPLES_PER_LINE = 8
-"""Samples that a channel needs for each line beside the group's harmonics."""
 
 
 @dataclass(frozen=True)

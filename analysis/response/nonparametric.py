@@ -70,6 +70,19 @@ _A = 0.35875, 0.48829, 0.14128, 0.01168  # of the Blackman-Harris window
 _WINDOW = _A[0] - _A[2], 3 * _A[3] - _A[1], 2 * _A[2], -4 * _A[3]  # the same by powers of cos
 _SHIFT = 1.5  # bins from a tone to the first bin of noise
 
+ORDER = 2
+"""Of the polynomials: the lowest that follows a curved response and an odd transient alike."""
+
+LEAST_FREEDOM = 6
+"""Complex residuals at least left over: their power is known to 40 %."""
+
+_SMALLEST_PIVOT = 1e-6
+"""Relative; below it the inputs of a window can't be separated."""
+
+CLEAR = 2.0
+"""Equation (3) is first order: the command's response to the reference is so many times the radius
+of its 95 % disc, or the line is left out."""
+
 
 def _float(values: object) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
@@ -298,16 +311,6 @@ def line_power(spectra: ComplexArray) -> FloatArray:
     return np.abs(spectra.mean(axis=-2)) ** 2 - noise_power(spectra)
 
 
-ORDER = 2
-"""Of the polynomials: the lowest that follows a curved response and an odd transient alike."""
-
-LEAST_FREEDOM = 6
-"""Complex residuals at least left over: their power is known to 40 %."""
-
-_SMALLEST_PIVOT = 1e-6
-"""Relative; below it the inputs of a window can't be separated."""
-
-
 @dataclass(frozen=True)
 class LocalResponse:
     """Responses at c bins from m inputs to one output.
@@ -391,11 +394,6 @@ def local_response(
     value[~sound] = np.nan
     covariance = noise[:, None, None] * (rows @ rows.conj().transpose(0, 2, 1))
     return LocalResponse(bins, value, covariance, noise, freedom)
-
-
-CLEAR = 2.0
-"""Equation (3) is first order: the command's response to the reference is so many times the radius
-of its 95 % disc, or the line is left out."""
 
 
 def indirect_response(

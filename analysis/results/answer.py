@@ -21,6 +21,37 @@ from undulog.capture.judgement.fault import Apart, Change, ExtraMotion, RestsOff
 _MOST = 12
 """Digits after which two numbers are taken for equal."""
 
+EITHER = "stick or play, not separable"
+STICK = "stick"
+PLAY = "play"
+
+KINDS = {
+    "frozen": ("sensor or joint", "stay exactly the same while the joint is commanded to move"),
+    "stale": ("sensor", "repeat old samples at new times"),
+    "wrapped": ("sensor", "are off by whole turns of a counter that wraps around"),
+    "jump": ("sensor", "make steps that no joint can make"),
+    "clipped": ("sensor", "have flat tops at the end of the sensor's range"),
+    "cut_off": (
+        "sensor or limit",
+        "have flat tops: all that the servo gives, or the sensor sees",
+    ),
+    "wrong_sign": ("sensor or joint", "have the opposite sign"),
+    "wrong_unit": ("sensor", "are larger or smaller by 180/pi: degrees for radians"),
+    "scale_mismatch": ("sensor", "differ in scale from another measure of the same motion"),
+    "gaps": ("record", "have gaps"),
+    "nan": ("record", "are partly not numbers"),
+    "duplicate_stamps": ("record", "have several samples of one time"),
+    "not_recorded": ("record", "were not recorded"),
+    "saturated": ("limit", "are at a limit of the robot"),
+    "stalled": ("limit", "show a joint that stands still at its full torque"),
+}
+"""Name to what it is about and to what the values then do."""
+
+FALSIFYING = frozenset(
+    name for name, (about, _) in KINDS.items() if about.startswith("sensor") and name != "stale"
+)
+"""These make a position unusable; a stale one is late by half a hold."""
+
 
 def percent(share: float, limit: float) -> str:
     """Print a share so that it reads as on the side of a limit that it is on.
@@ -278,11 +309,6 @@ def _first_clause(text: str) -> str:
     return f"{clause[:1].upper()}{clause[1:]}{'' if clause.endswith('...') else '.'}"
 
 
-EITHER = "stick or play, not separable"
-STICK = "stick"
-PLAY = "play"
-
-
 @dataclass(frozen=True)
 class Reversal:
     """The dead band at one end of the motion.
@@ -327,33 +353,6 @@ class DeadBand:
 
 Span = tuple[float, float]
 """Start and end [s]."""
-
-KINDS = {
-    "frozen": ("sensor or joint", "stay exactly the same while the joint is commanded to move"),
-    "stale": ("sensor", "repeat old samples at new times"),
-    "wrapped": ("sensor", "are off by whole turns of a counter that wraps around"),
-    "jump": ("sensor", "make steps that no joint can make"),
-    "clipped": ("sensor", "have flat tops at the end of the sensor's range"),
-    "cut_off": (
-        "sensor or limit",
-        "have flat tops: all that the servo gives, or the sensor sees",
-    ),
-    "wrong_sign": ("sensor or joint", "have the opposite sign"),
-    "wrong_unit": ("sensor", "are larger or smaller by 180/pi: degrees for radians"),
-    "scale_mismatch": ("sensor", "differ in scale from another measure of the same motion"),
-    "gaps": ("record", "have gaps"),
-    "nan": ("record", "are partly not numbers"),
-    "duplicate_stamps": ("record", "have several samples of one time"),
-    "not_recorded": ("record", "were not recorded"),
-    "saturated": ("limit", "are at a limit of the robot"),
-    "stalled": ("limit", "show a joint that stands still at its full torque"),
-}
-"""Name to what it is about and to what the values then do."""
-
-FALSIFYING = frozenset(
-    name for name, (about, _) in KINDS.items() if about.startswith("sensor") and name != "stale"
-)
-"""These make a position unusable; a stale one is late by half a hold."""
 
 
 @dataclass(frozen=True)

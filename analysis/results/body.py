@@ -10,6 +10,11 @@ TWIN_ACCURACY = (0.86, 0.93)
 """How often it is right in the twin: the least and the largest mean, over gaits that lift links, of
 the shares of contacts and of lifted links that are recognised (``studies/contact_tables.py``)."""
 
+EFFECTIVE = (
+    "effective: exact to first order where friction is viscous; under Coulomb friction, which is "
+    "rate-independent but not linear, it holds around this gait only"
+)
+
 
 @dataclass(frozen=True)
 class BodyPoint:
@@ -130,12 +135,6 @@ class BodyShape:
 
     planes: tuple[PlaneShape, ...] = ()
     travel: BodyTravel | None = None
-
-
-EFFECTIVE = (
-    "effective: exact to first order where friction is viscous; under Coulomb friction, which is "
-    "rate-independent but not linear, it holds around this gait only"
-)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ from .estimate import Estimate, PresentedResult, Provenance, leaves_out_zero
 BODY = "body"
 """Where a difference is that belongs to no joint."""
 
+SIGNIFICANT = 0.05
+"""Family-wise level at which a module is named."""
+
 
 def of_body(place: str) -> bool:
     """Return whether a place is the body, or one of its planes: ``body, yaw``."""
@@ -184,10 +187,6 @@ class Comparison(PresentedResult):
     def commanded(self) -> bool:
         """Whether the sessions have commands, and so gains and lags."""
         return not any(one.quantity in ("amplitude", "frequency") for one in self.differences)
-
-
-SIGNIFICANT = 0.05
-"""Family-wise level at which a module is named."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,11 @@ from undulog.capture.common.arrays import FloatArray
 
 from .estimate import Estimate, PresentedResult
 
+LTI_LABEL = (
+    "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); the "
+    "nonlinearity measures the departure from that"
+)
+
 
 @dataclass(frozen=True, repr=False)
 class Coupling(PresentedResult):
@@ -35,12 +40,6 @@ Rows = tuple[tuple[float, ...], ...]
 def rows_of(values: FloatArray) -> Rows:
     """Convert a matrix of shape (m, n) to plain numbers."""
     return tuple(tuple(float(x) for x in row) for row in values)
-
-
-LTI_LABEL = (
-    "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); the "
-    "nonlinearity measures the departure from that"
-)
 
 
 @dataclass(frozen=True)

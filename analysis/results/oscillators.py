@@ -7,6 +7,11 @@ from dataclasses import dataclass
 from .coupling import Rows
 from .estimate import Estimate
 
+ENTRAINMENT_LABEL = (
+    "P read as entrainment, P = (Gamma + L)^-1 Gamma: Gamma^-1 L = P^-1 - I, coupling relative to "
+    "the entrainment by the command; absolute rates need the way back from kicks"
+)
+
 
 @dataclass(frozen=True)
 class Link:
@@ -65,12 +70,6 @@ class ChainCoupling:
     reach: int
     links: tuple[Link, ...] = ()
     oscillators: tuple[Rate, ...] = ()
-
-
-ENTRAINMENT_LABEL = (
-    "P read as entrainment, P = (Gamma + L)^-1 Gamma: Gamma^-1 L = P^-1 - I, coupling relative to "
-    "the entrainment by the command; absolute rates need the way back from kicks"
-)
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,16 @@ from .gaits import gait_windows, gaits_in_windows
 from .heterogeneity import heterogeneity_indices
 from .runs import coupling_of_one_gait
 
+UNDECIDED_ENDS = (
+    "without a robot description the order of the joints is that of the record, and which end is "
+    "the head is unknown: directions are relative to that order, and whether the wave runs towards "
+    "the head or the tail isn't known; a lag from joint to joint is known up to whole turns, the "
+    "smallest is given"
+)
+
+_FEW = 1e-3
+"""Up to one sample in a thousand left out is a note: no loss for a fit."""
+
 
 def _warn_flags(
     artefacts: Iterable[Artefact], joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn
@@ -93,17 +103,6 @@ def _warn_flags(
             f"{', '.join(lost)}: no response at the gait frequency that differs from noise: "
             "gain and lag are null"
         )
-
-
-UNDECIDED_ENDS = (
-    "without a robot description the order of the joints is that of the record, and which end is "
-    "the head is unknown: directions are relative to that order, and whether the wave runs towards "
-    "the head or the tail isn't known; a lag from joint to joint is known up to whole turns, the "
-    "smallest is given"
-)
-
-_FEW = 1e-3
-"""Up to one sample in a thousand left out is a note: no loss for a fit."""
 
 
 def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:

@@ -41,6 +41,9 @@ is sudden: controllers change them smoothly."""
 STEP_RAD = 0.05
 """The same for offset, lag and phase [rad]."""
 
+LEAST_COVERED = 0.9
+"""A cycle with samples over less of its length is missing."""
+
 
 @dataclass(frozen=True)
 class _Pace:
@@ -246,10 +249,6 @@ def _where(known: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, .
     """Return the values, or None where they are not known."""
     pairs = zip(values, known.tolist(), strict=True)
     return tuple(value if there else None for value, there in pairs)
-
-
-LEAST_COVERED = 0.9
-"""A cycle with samples over less of its length is missing."""
 
 
 @dataclass(frozen=True)

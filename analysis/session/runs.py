@@ -28,6 +28,15 @@ from ..results.answer import distinct
 from ..results.coupling import Coupling
 from ..signals.columns import by_plane
 
+HEADING = "heading_rad"
+"""Key of the metadata records ``undulog.plan`` and ``undulog`` with the heading [rad]."""
+
+SAME_COMMAND = 0.01
+"""Largest deviation of a command, over its amplitude, that is the same gait still."""
+
+SAME_FREQUENCY = 0.005
+"""Relative."""
+
 
 def coupling_of_one_gait(joints: int) -> Coupling:
     """What one steady gait says about the coupling: nothing, and what would.
@@ -50,10 +59,6 @@ def coupling_of_one_gait(joints: int) -> Coupling:
         why = "one joint has no neighbour whose response is known"
         record = "a session with a chain of driven joints"
     return Coupling(identifiable=False, why=why, record=record)
-
-
-HEADING = "heading_rad"
-"""Key of the metadata records ``undulog.plan`` and ``undulog`` with the heading [rad]."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +142,6 @@ def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) ->
     cy, sy = math.cos(yaw), math.sin(yaw)
     x = float(mean @ [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr])
     return math.atan2(-x, float(mean @ [-sp, cp * sr, cp * cr]))
-
-
-SAME_COMMAND = 0.01
-"""Largest deviation of a command, over its amplitude, that is the same gait still."""
-
-SAME_FREQUENCY = 0.005
-"""Relative."""
 
 
 class Role(StrEnum):

@@ -60,6 +60,37 @@ _BESIDE = 3
 _TURNS = (np.pi, 2 * np.pi, 4 * np.pi)
 """Sizes [rad] by which a single step is known as a wrap."""
 
+AT_LIMIT_RAD = 1e-4
+"""A position this close to its limit, or beyond it, is at the limit."""
+
+AT_LIMIT = 0.995
+"""So large a part of any other limit is at the limit."""
+
+AT_LIMIT_SHARE = 0.01
+"""Less of the time at a limit is touching it."""
+
+STALL_SHARE = 0.9
+"""Part of the stall torque that a stalled joint gives at least."""
+
+STALL_S = 0.2
+DWELL = 3.0
+"""Times the turning point of a sine that a joint of unknown stall torque stands still."""
+
+CONSTANT = 0.05
+"""Standard deviation over mean below which an effort is constant."""
+
+STANDING = 0.05
+"""Standing still: slower than this part of what the joint does at most."""
+
+GAP_SHARE = 1e-3
+"""Less of a session without samples is no gap worth a word."""
+
+DRIVE = frozenset({"effort", "current", "voltage"})
+"""Their flat tops may be all that the servo gives."""
+
+MOST_RATE = 50.0
+"""Rate that no joint of a robot without description exceeds [rad/s]."""
+
 
 @dataclass(frozen=True)
 class Jumps:
@@ -125,29 +156,6 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
         calm = near[near <= possible[k]]
         alone[k] = calm.size > 1 and size[k] > ABOVE_NEIGHBOURS * float(calm.max())
     return alone
-
-
-AT_LIMIT_RAD = 1e-4
-"""A position this close to its limit, or beyond it, is at the limit."""
-
-AT_LIMIT = 0.995
-"""So large a part of any other limit is at the limit."""
-
-AT_LIMIT_SHARE = 0.01
-"""Less of the time at a limit is touching it."""
-
-STALL_SHARE = 0.9
-"""Part of the stall torque that a stalled joint gives at least."""
-
-STALL_S = 0.2
-DWELL = 3.0
-"""Times the turning point of a sine that a joint of unknown stall torque stands still."""
-
-CONSTANT = 0.05
-"""Standard deviation over mean below which an effort is constant."""
-
-STANDING = 0.05
-"""Standing still: slower than this part of what the joint does at most."""
 
 
 @dataclass(frozen=True)
@@ -265,16 +273,6 @@ def _constant(effort: Series, span: Span) -> bool:
     i, j = np.searchsorted(effort.t_s, span)
     inside = effort.values[i : j + 1]
     return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))
-
-
-GAP_SHARE = 1e-3
-"""Less of a session without samples is no gap worth a word."""
-
-DRIVE = frozenset({"effort", "current", "voltage"})
-"""Their flat tops may be all that the servo gives."""
-
-MOST_RATE = 50.0
-"""Rate that no joint of a robot without description exceeds [rad/s]."""
 
 
 @dataclass(frozen=True)

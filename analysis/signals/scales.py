@@ -17,6 +17,43 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.answer import Span
 
+DEGREE = float(np.degrees(1.0))
+UNIT_SLACK = 1.6
+"""Factor within which a ratio is taken for 180/pi: a weak servo's gain is in it, too."""
+
+OPPOSITE = -0.7
+"""Correlation of a response with its command at full size, below which its sign is wrong: 45
+degrees from opposite phase."""
+
+EARLY = -0.26
+"""Correlation of a response with the rate of its command, below which its sign is right: beyond a
+resonance of the body a sound joint lags by nearly half a cycle, and one of the wrong sign by half a
+cycle or more. This is 15 degrees less, for clocks that differ."""
+
+EITHER_WAY = 0.75
+"""Share of the cycles that must follow the command, upright or not, for a sign to be decided:
+of a multisine near a resonance every cycle has another phase."""
+
+FULL_SIZE = (0.5, 2.0)
+MIN_CORRELATION = 0.98
+"""Correlation of a position with the integral of its velocity that lets scales be compared."""
+
+SAME_SCALE = 1.05
+"""Two sensors of one angle whose scales differ by less than this agree."""
+
+SAME_RATE = 1.25
+"""A velocity and its position that differ by less than this agree: sampled in step with a ripple of
+the control period, a sound velocity may be off by 14 % (twin)."""
+
+SURE = 4.0
+"""Standard errors by which a scale is off beyond what counts as agreement."""
+
+HOLE_SHARE = 0.02
+"""More of a cycle without samples says nothing."""
+
+_FEW = 3
+"""A cycle with so few samples says nothing."""
+
 
 def runs(marked: BoolArray) -> tuple[IntArray, IntArray]:
     """Runs of marked samples.
@@ -75,44 +112,6 @@ def inside(t_s: FloatArray, spans: Iterable[Span]) -> BoolArray:
     for start, stop in spans:
         marked[np.searchsorted(t_s, start, "left") : np.searchsorted(t_s, stop, "right")] = True
     return marked
-
-
-DEGREE = float(np.degrees(1.0))
-UNIT_SLACK = 1.6
-"""Factor within which a ratio is taken for 180/pi: a weak servo's gain is in it, too."""
-
-OPPOSITE = -0.7
-"""Correlation of a response with its command at full size, below which its sign is wrong: 45
-degrees from opposite phase."""
-
-EARLY = -0.26
-"""Correlation of a response with the rate of its command, below which its sign is right: beyond a
-resonance of the body a sound joint lags by nearly half a cycle, and one of the wrong sign by half a
-cycle or more. This is 15 degrees less, for clocks that differ."""
-
-EITHER_WAY = 0.75
-"""Share of the cycles that must follow the command, upright or not, for a sign to be decided:
-of a multisine near a resonance every cycle has another phase."""
-
-FULL_SIZE = (0.5, 2.0)
-MIN_CORRELATION = 0.98
-"""Correlation of a position with the integral of its velocity that lets scales be compared."""
-
-SAME_SCALE = 1.05
-"""Two sensors of one angle whose scales differ by less than this agree."""
-
-SAME_RATE = 1.25
-"""A velocity and its position that differ by less than this agree: sampled in step with a ripple of
-the control period, a sound velocity may be off by 14 % (twin)."""
-
-SURE = 4.0
-"""Standard errors by which a scale is off beyond what counts as agreement."""
-
-HOLE_SHARE = 0.02
-"""More of a cycle without samples says nothing."""
-
-_FEW = 3
-"""A cycle with so few samples says nothing."""
 
 
 @dataclass(frozen=True)

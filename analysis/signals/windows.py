@@ -54,6 +54,15 @@ _SUBHARMONIC = 0.1
 
 _LEAST_SAMPLES = 8
 
+_STEADY = ("A", "omega", "lag", "offset")
+"""Logged gait values that must stay; the phase runs on."""
+
+_SAME = 1e-6
+"""Relative change of a gait value that counts as none."""
+
+_CYCLE_SLACK = 0.01
+"""A stretch this much of a cycle short of a whole number still counts as whole."""
+
 
 def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tuple[float, float]:
     """Find where the commands have their steady amplitude.
@@ -205,16 +214,6 @@ class Span:
     start_s: float
     stop_s: float
     cycles: int
-
-
-_STEADY = ("A", "omega", "lag", "offset")
-"""Logged gait values that must stay; the phase runs on."""
-
-_SAME = 1e-6
-"""Relative change of a gait value that counts as none."""
-
-_CYCLE_SLACK = 0.01
-"""A stretch this much of a cycle short of a whole number still counts as whole."""
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ Carrier: TypeAlias = tuple[int, tuple[tuple[int, ...], ...]]
 
 _BODY = np.uint32(EXTENDED_FLAG | ID_MASK)
 
+_SILENT, _UNDIRECTED = -1, -2
+
 
 @dataclass(frozen=True)
 class DecodedSignals:
@@ -154,7 +156,6 @@ def robstride_keys(keys: IntArray) -> IntArray:
 
 
 _KEYS = {"robstride": robstride_keys, "cybergear": robstride_keys}
-_SILENT, _UNDIRECTED = -1, -2
 
 
 class BusDecoder:

@@ -18,6 +18,16 @@ if TYPE_CHECKING:
     from ..exchange.column_map import ColumnMap
     from ..robot.model import Robot
 
+_LEROBOT, _BAG = "is a LeRobot dataset, which names its columns itself", "is a bag of ROS"
+_TABLE, _FRAMES = "holds no CAN frames", "holds CAN frames"
+_OPTIONS = {
+    _LEROBOT: ("--unit", "--episode"),
+    _BAG: ("--command-topic", "--response-topic"),
+    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map", "--fps"),
+    _FRAMES: ("--bus",),
+}
+"""Kind of a log to the options that are for it alone."""
+
 
 def import_log(
     log: Path,
@@ -140,17 +150,6 @@ def _report_imports(reports: Sequence[ImportReport], *, json: bool) -> int:
     answer = facts[0] if len(facts) == 1 else {"sessions": facts}
     emit(answer, (line for report in reports for line in _import_lines(report)), as_json=json)
     return 0 if all(report.complete for report in reports) else 1
-
-
-_LEROBOT, _BAG = "is a LeRobot dataset, which names its columns itself", "is a bag of ROS"
-_TABLE, _FRAMES = "holds no CAN frames", "holds CAN frames"
-_OPTIONS = {
-    _LEROBOT: ("--unit", "--episode"),
-    _BAG: ("--command-topic", "--response-topic"),
-    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map", "--fps"),
-    _FRAMES: ("--bus",),
-}
-"""Kind of a log to the options that are for it alone."""
 
 
 def _check_options(log: Path, kind: str, given: Sequence[str]) -> None:

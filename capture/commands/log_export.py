@@ -19,6 +19,15 @@ if TYPE_CHECKING:
 
 Target = Literal["wide", "lerobot", "rosbag2", "tum", "foxglove-layout", "plotjuggler-layout"]
 
+_FOR = {
+    "bus": "CAN frames",
+    "topics": "tables and layouts",
+    "fps": "LeRobot",
+    "task": "LeRobot",
+    "frame": "trajectories",
+}
+"""Option to the outputs that have it."""
+
 
 def log_export(
     *sessions: Path,
@@ -141,15 +150,6 @@ def _target(to: str | None, output: Path) -> tuple[str, _Target]:
         f"{', '.join(_TARGETS)}"
     )
 
-
-_FOR = {
-    "bus": "CAN frames",
-    "topics": "tables and layouts",
-    "fps": "LeRobot",
-    "task": "LeRobot",
-    "frame": "trajectories",
-}
-"""Option to the outputs that have it."""
 
 _FRAMES = _Target("export", "export_log", "has CAN frames", ("bus",))
 _TABLE = _Target("export", "export_columns", "has joint columns", ("topics",))

@@ -30,6 +30,11 @@ if TYPE_CHECKING:
 _UNITS = Path("/etc/systemd/system")
 _Words = Annotated[tuple[str, ...], Parameter(show_default=False)]
 
+_COMPLETE_S = 3600.0
+"""Longest wait for a recording to be complete [s]: the recorder itself has no limit on it, since
+its data must reach the disk, and goes on where this gives up."""
+_FAULTS = ("malformed", "error_frames", "reconnects")
+
 
 def record(
     *sources: Annotated[str, Parameter(name="SOURCE")],
@@ -172,10 +177,6 @@ def _lines(report: RecordReport) -> Iterator[str]:
 
 
 _Text = Annotated[str, Parameter(show_default=False)]
-_COMPLETE_S = 3600.0
-"""Longest wait for a recording to be complete [s]: the recorder itself has no limit on it, since
-its data must reach the disk, and goes on where this gives up."""
-_FAULTS = ("malformed", "error_frames", "reconnects")
 
 
 def counted_faults(source: Mapping[str, Any]) -> list[str]:

@@ -39,6 +39,65 @@ _JOINTS = (
     Column("stall/(N m)"),
 )
 
+_TEMPLATE = """\
+# The description of a robot, to start from. All values in SI: m, kg, s, rad, N m, A, V.
+# `undulog robot check` holds it to the rules, the page "Robot descriptions" of the manual has them.
+
+name = {name}
+description = ""            # one sentence
+clock = "host"              # whose clock stamps the samples: host, device or simulated
+assumed = ["links", "joints", "servo"]   # take out of this list what you have filled in
+
+{origin}
+# plane: horizontal (turns about z, yaw) or vertical (about y, pitch).
+joints = [
+{joints}
+]
+
+[defaults.link]             # of every link, one more than joints; an entry of `links` may differ
+length = 0.06               # assumed: joint to joint
+radius = 0.025              # assumed
+mass = 0.1                  # assumed
+inertia = [4e-5, 5e-5, 5e-5]  # assumed: about the centre, along x (forward), y, z
+# mesh = "shell.stl"        # for the picture, a file beside this one
+# mesh_scale = 0.001        # metres in one unit of it
+
+[defaults.servo]            # of every joint, for the twin; assumed
+supply_v = 6.0
+stall_torque = 1.5          # at full voltage and standstill
+torque_constant = 1.0       # N m/A, at the joint
+proportional_gain = 8.0     # duty per rad of error
+viscous_friction = 0.005    # N m s/rad
+coulomb_friction = 0.03
+# Stiffer gears or lighter links need shorter steps than 1 ms: `physics_rate_hz` of a scenario.
+gear_stiffness = 20.0       # N m/rad
+gear_damping = 0.01         # N m s/rad
+
+# [safety]                  # limits of driving it over a bus; without them it is never driven
+# max_rate = 4.0            # rad/s, of commands
+# ramp_rate = 0.5           # rad/s, to the first pose and down again
+# max_tracking_error = 0.35 # between command and measured angle
+# max_current = 1.4
+# max_temperature = 70.0    # degC
+# reply_timeout_s = 0.25    # a joint that reports nothing for so long is lost
+# max_late_s = 0.2          # a control tick that is later stops the drive
+
+# [bus]                     # where each quantity is found on its CAN bus
+# databases = ["robot.dbc"] # beside this file
+# bitrate = 1_000_000
+# signals = [
+#   {{ message = "Command", signal = "Angle", direction = "tx",
+#      target = "{first}", quantity = "command", unit = "deg" }},
+#   {{ message = "State", signal = "Angle", direction = "rx",
+#      target = "{first}", quantity = "position", unit = "deg" }},
+# ]
+"""
+
+_NEW = "# From the head to the tail; these two are examples."
+_SEEN = """\
+# From {log}, in its order: put them in that of the chain, the head first. The limits are what the
+# log shows with a margin of 5 %, not those of the robot."""
+
 
 def robot_list(*, json: bool = False) -> None:
     """List the shipped robots: name, joints, and what each is.
@@ -282,66 +341,6 @@ def _rates(t_ns: IntArray, values: FloatArray) -> FloatArray:
 
     steps = np.diff(t_ns) / NS
     return np.abs(np.diff(values))[steps > 0] / steps[steps > 0]
-
-
-_TEMPLATE = """\
-# The description of a robot, to start from. All values in SI: m, kg, s, rad, N m, A, V.
-# `undulog robot check` holds it to the rules, the page "Robot descriptions" of the manual has them.
-
-name = {name}
-description = ""            # one sentence
-clock = "host"              # whose clock stamps the samples: host, device or simulated
-assumed = ["links", "joints", "servo"]   # take out of this list what you have filled in
-
-{origin}
-# plane: horizontal (turns about z, yaw) or vertical (about y, pitch).
-joints = [
-{joints}
-]
-
-[defaults.link]             # of every link, one more than joints; an entry of `links` may differ
-length = 0.06               # assumed: joint to joint
-radius = 0.025              # assumed
-mass = 0.1                  # assumed
-inertia = [4e-5, 5e-5, 5e-5]  # assumed: about the centre, along x (forward), y, z
-# mesh = "shell.stl"        # for the picture, a file beside this one
-# mesh_scale = 0.001        # metres in one unit of it
-
-[defaults.servo]            # of every joint, for the twin; assumed
-supply_v = 6.0
-stall_torque = 1.5          # at full voltage and standstill
-torque_constant = 1.0       # N m/A, at the joint
-proportional_gain = 8.0     # duty per rad of error
-viscous_friction = 0.005    # N m s/rad
-coulomb_friction = 0.03
-# Stiffer gears or lighter links need shorter steps than 1 ms: `physics_rate_hz` of a scenario.
-gear_stiffness = 20.0       # N m/rad
-gear_damping = 0.01         # N m s/rad
-
-# [safety]                  # limits of driving it over a bus; without them it is never driven
-# max_rate = 4.0            # rad/s, of commands
-# ramp_rate = 0.5           # rad/s, to the first pose and down again
-# max_tracking_error = 0.35 # between command and measured angle
-# max_current = 1.4
-# max_temperature = 70.0    # degC
-# reply_timeout_s = 0.25    # a joint that reports nothing for so long is lost
-# max_late_s = 0.2          # a control tick that is later stops the drive
-
-# [bus]                     # where each quantity is found on its CAN bus
-# databases = ["robot.dbc"] # beside this file
-# bitrate = 1_000_000
-# signals = [
-#   {{ message = "Command", signal = "Angle", direction = "tx",
-#      target = "{first}", quantity = "command", unit = "deg" }},
-#   {{ message = "State", signal = "Angle", direction = "rx",
-#      target = "{first}", quantity = "position", unit = "deg" }},
-# ]
-"""
-
-_NEW = "# From the head to the tail; these two are examples."
-_SEEN = """\
-# From {log}, in its order: put them in that of the chain, the head first. The limits are what the
-# log shows with a margin of 5 %, not those of the robot."""
 
 
 def draft(name: str, joints: Sequence[SeenJoint] | None = None, log: str = "") -> Robot:

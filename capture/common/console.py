@@ -25,6 +25,12 @@ _UNSAFE = ("Cc", "Cf", "Cs", "Cn", "Co", "Zl", "Zp")
 """Unicode categories: control, format (also text direction), surrogate, unassigned, private, line
 and paragraph ends. All characters that XML forbids are among them."""
 
+UNLIMITED = 10_000
+"""A width at which nothing wraps."""
+
+_GAP = 2
+_NARROWEST = 6
+
 
 def plain(text: str) -> str:
     r"""Escape the control characters of a text.
@@ -138,10 +144,6 @@ def refuse_existing(path: Path, *, force: bool) -> None:
         raise OutputExistsError(there)
 
 
-UNLIMITED = 10_000
-"""A width at which nothing wraps."""
-
-
 def output_width() -> int:
     """Return the width of the terminal that the output goes to [cells], unlimited if it is none."""
     from shutil import get_terminal_size
@@ -154,9 +156,6 @@ Warn = Callable[[str], None]
 
 Cells = Sequence[tuple[str, str]]
 """Text and style of each cell of a row."""
-
-_GAP = 2
-_NARROWEST = 6
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,33 @@ _ON_USE = ("cantools.tester",)
 
 _hidden: set[str] = set()
 
+_BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
+"""Packages whose versions go into results."""
+
+EXTRAS = (
+    *("sim", "mujoco", "numba", "replay", "report", "parquet", "mf4", "bags", "serial"),
+    *("remote", "cluster", "catalog"),
+)
+"""Every extra of ``pyproject.toml`` but ``all``, which is all of them."""
+
+_OF_MODULE = {
+    "pybullet": "sim",
+    "tomlkit": "sim",
+    "mujoco": "mujoco",
+    "numba": "numba",
+    "rerun": "replay",
+    "jinja2": "report",
+    "markupsafe": "report",
+    "matplotlib": "report",
+    "asammdf": "mf4",
+    "distributed": "cluster",
+    "pyarrow": "parquet",
+    "duckdb": "catalog",
+    "obstore": "remote",
+    "statsmodels": "catalog",
+}
+"""Optional module to the extra that installs it."""
+
 
 class _ModuleOnUse(ModuleType):
     """Stands for a module until one of its names is used."""
@@ -80,34 +107,6 @@ def attach(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], An
         return getattr(import_module(f".{modules[name]}", package), name)
 
     return get, sorted(modules)
-
-
-_BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
-"""Packages whose versions go into results."""
-
-EXTRAS = (
-    *("sim", "mujoco", "numba", "replay", "report", "parquet", "mf4", "bags", "serial"),
-    *("remote", "cluster", "catalog"),
-)
-"""Every extra of ``pyproject.toml`` but ``all``, which is all of them."""
-
-_OF_MODULE = {
-    "pybullet": "sim",
-    "tomlkit": "sim",
-    "mujoco": "mujoco",
-    "numba": "numba",
-    "rerun": "replay",
-    "jinja2": "report",
-    "markupsafe": "report",
-    "matplotlib": "report",
-    "asammdf": "mf4",
-    "distributed": "cluster",
-    "pyarrow": "parquet",
-    "duckdb": "catalog",
-    "obstore": "remote",
-    "statsmodels": "catalog",
-}
-"""Optional module to the extra that installs it."""
 
 
 def missing_package(error: BaseException) -> str | None:

@@ -38,15 +38,6 @@ if TYPE_CHECKING:
     from .arrays import FloatArray
     from .process import StopRequest
 
-
-def is_file(path: Path) -> bool:
-    """Return whether a path is that of a file, also if the file system rejects its name."""
-    try:
-        return path.is_file()
-    except OSError:  # too long
-        return False
-
-
 _KINDS = (
     (stat.S_ISFIFO, "named pipe"),
     (stat.S_ISSOCK, "socket"),
@@ -56,6 +47,17 @@ _KINDS = (
 
 _OPEN_PIPES = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")
 """Paths of descriptors that are open already, as a shell passes them: ``<(command)``."""
+
+_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
+"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a path is that of a file, also if the file system rejects its name."""
+    try:
+        return path.is_file()
+    except OSError:  # too long
+        return False
 
 
 def check_regular(path: Path | str) -> None:
@@ -325,10 +327,6 @@ def listen_at(listener: socket.socket, path: Path, backlog: int) -> None:
         path.hardlink_to(draft)
     finally:
         draft.unlink(missing_ok=True)
-
-
-_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
-"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
 
 
 def csv_writer(stream: TextIO, texts: Sequence[str]) -> Any:

@@ -33,6 +33,19 @@ _NICE = -10  # requested where real-time priority is refused
 _REAL_TIME = os.sched_param(1)
 _RESET = os.SCHED_RESET_ON_FORK  # for what the recorder starts: a viewer, a shell
 
+_JOIN_SLICES = 20
+
+_MOST_BY_DEFAULT = 4
+"""Beyond this the reader itself, which is one thread, is what takes the time."""
+
+MANY = 1 << 18
+"""Samples of all channels from which on the work is shared out."""
+
+_SHARES = 16
+"""Shares for each thread, so that none waits long for the last."""
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 @dataclass(frozen=True)
 class Priority:
@@ -95,9 +108,6 @@ def _named(policy: int, nice: int) -> str:
     return f"nice {nice}" if policy == os.SCHED_OTHER else f"policy {policy}"
 
 
-_JOIN_SLICES = 20
-
-
 def join_running(thread: threading.Thread, limit_s: float) -> bool:
     """Wait for the end of a thread for a time in which this process runs.
 
@@ -115,10 +125,6 @@ def join_running(thread: threading.Thread, limit_s: float) -> bool:
         if not thread.is_alive():
             return True
     return False
-
-
-_MOST_BY_DEFAULT = 4
-"""Beyond this the reader itself, which is one thread, is what takes the time."""
 
 
 def threads_or_default(threads: int | None) -> int:
@@ -141,12 +147,6 @@ def threads_or_default(threads: int | None) -> int:
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-
-MANY = 1 << 18
-"""Samples of all channels from which on the work is shared out."""
-
-_SHARES = 16
-"""Shares for each thread, so that none waits long for the last."""
 
 
 def in_threads(
@@ -227,9 +227,6 @@ def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
         yield pool
     finally:  # also when the caller stops early: pending work is cancelled
         pool.shutdown(cancel_futures=True)
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:

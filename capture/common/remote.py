@@ -26,6 +26,25 @@ _PIECE = 8 << 20
 _TIMES = {"timeout": timedelta(seconds=60), "connect_timeout": timedelta(seconds=10)}
 _RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
 
+_CAUSES = {
+    "FileNotFoundError": "no such object",
+    "NotFoundError": "no such object",
+    "PermissionDeniedError": "the server refuses access; are the credentials those of its owner?",
+    "UnauthenticatedError": "the server asks for credentials",
+    "NotSupportedError": "the server sends no ranges of bytes; download the file first",
+}
+_CREDENTIALS = {
+    "s": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY; AWS_SKIP_SIGNATURE=true is for public buckets",
+    "g": "GOOGLE_APPLICATION_CREDENTIALS; GOOGLE_SKIP_SIGNATURE=true is for public buckets",
+    "a": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+}
+_WORDS = {
+    "416": "the file is empty (0 bytes)",
+    "169.254.169.254": "no credentials are set: ",
+    "Account must be specified": "no account is set: ",
+    "error sending request": "the server can't be reached",
+}
+
 
 class RemotePath(PosixPath):
     """A URL as a path, for its name, stem and siblings; nothing on this computer has it.
@@ -161,26 +180,6 @@ def _plain_endpoint() -> bool:
     """Whether the environment names an endpoint without TLS, as a server in a lab may be."""
     names = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT")
     return any(os.environ.get(name, "").startswith("http://") for name in names)
-
-
-_CAUSES = {
-    "FileNotFoundError": "no such object",
-    "NotFoundError": "no such object",
-    "PermissionDeniedError": "the server refuses access; are the credentials those of its owner?",
-    "UnauthenticatedError": "the server asks for credentials",
-    "NotSupportedError": "the server sends no ranges of bytes; download the file first",
-}
-_CREDENTIALS = {
-    "s": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY; AWS_SKIP_SIGNATURE=true is for public buckets",
-    "g": "GOOGLE_APPLICATION_CREDENTIALS; GOOGLE_SKIP_SIGNATURE=true is for public buckets",
-    "a": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
-}
-_WORDS = {
-    "416": "the file is empty (0 bytes)",
-    "169.254.169.254": "no credentials are set: ",
-    "Account must be specified": "no account is set: ",
-    "error sending request": "the server can't be reached",
-}
 
 
 def _failed(path: RemotePath, error: Exception) -> InputFileError:

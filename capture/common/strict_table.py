@@ -32,6 +32,16 @@ _LONGEST_TEXT = 2000
 _SMALLEST = 1e-30
 """With the largest, 1e15: powers and quotients of quantities in SI units don't overflow."""
 
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
+    ">": operator.gt,
+    ">=": operator.ge,
+    "<=": operator.le,
+    "other than": operator.ne,
+    "0 or of a size from 1e-30 to": lambda number, limit: (
+        number == 0 or _SMALLEST <= abs(number) <= limit
+    ),
+}
+
 
 def shown(value: object) -> str:
     """Format a TOML value for a fault message: strings quoted, tables by kind, arrays cut."""
@@ -56,17 +66,6 @@ def listed(words: Iterable[str], found: object = None) -> str:
 
         near = get_close_matches(found, valid, n=1)
     return (", ".join(valid) or "none") + (f" (did you mean {near[0]}?)" if near else "")
-
-
-_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
-    ">": operator.gt,
-    ">=": operator.ge,
-    "<=": operator.le,
-    "other than": operator.ne,
-    "0 or of a size from 1e-30 to": lambda number, limit: (
-        number == 0 or _SMALLEST <= abs(number) <= limit
-    ),
-}
 
 
 @dataclass(frozen=True)

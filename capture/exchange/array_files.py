@@ -51,6 +51,9 @@ _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _PUT = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET = {"GET", "BINGET", "LONG_BINGET"}
 
+_COMPRESSED, _PIECE = 15, 1 << 16  # of .mat
+_NPY_HEADER = 1 << 17  # bytes
+
 
 @dataclass(frozen=True)
 class _Global:
@@ -282,10 +285,6 @@ class _Storages:
                 refuse(self._path, f"tensors of {self._size} bytes; {MOST_BYTES} at most")
             self._read[key] = read_entry(self._archive, info)
         return self._read[key]
-
-
-_COMPRESSED, _PIECE = 15, 1 << 16  # of .mat
-_NPY_HEADER = 1 << 17  # bytes
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:

@@ -33,6 +33,29 @@ from ..robot.model import Robot
 from .can_logs import log_suffix, open_frame_log
 from .frame_log import DIRECTIONS_KEY, FrameLog, LogBlock
 
+LEVEL: Compression = 2
+"""Of compression: a third less time than level 3 for a few per cent more bytes."""
+
+FLOAT32: Compression = ZstdCompressionParameters(
+    window_log=20,
+    hash_log=12,
+    chain_log=12,
+    search_log=1,
+    min_match=5,
+    target_length=1,
+    strategy=STRATEGY_FAST,
+    write_checksum=True,
+)
+"""Of messages whose numbers had single precision: those of neighbours share few bytes, so that a
+table of matches in the nearest cache finds as many. A quarter to a third less time than level 2,
+for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
+
+_REUSED = 1 << 24
+"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and
+getting a new page from the system takes longer than filling it."""
+
+_BATCH_NS = 50_000_000  # one message of raw frames spans at most this
+
 
 @dataclass
 class ImportReport:
@@ -99,29 +122,6 @@ def digest_of(files: Sequence[Path]) -> str:
     return hashlib.sha256(parts.encode()).hexdigest()
 
 
-LEVEL: Compression = 2
-"""Of compression: a third less time than level 3 for a few per cent more bytes."""
-
-FLOAT32: Compression = ZstdCompressionParameters(
-    window_log=20,
-    hash_log=12,
-    chain_log=12,
-    search_log=1,
-    min_match=5,
-    target_length=1,
-    strategy=STRATEGY_FAST,
-    write_checksum=True,
-)
-"""Of messages whose numbers had single precision: those of neighbours share few bytes, so that a
-table of matches in the nearest cache finds as many. A quarter to a third less time than level 2,
-for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
-
-
-_REUSED = 1 << 24
-"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and
-getting a new page from the system takes longer than filling it."""
-
-
 @contextmanager
 def imported_session(
     source: Path,
@@ -167,9 +167,6 @@ def imported_session(
         ) as writer,
     ):
         yield writer
-
-
-_BATCH_NS = 50_000_000  # one message of raw frames spans at most this
 
 
 def import_can(

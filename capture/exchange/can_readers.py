@@ -51,6 +51,27 @@ _BASE_SIZE = OBJ_HEADER_BASE_STRUCT.size
 _SIZE_AT = 8
 """Offset of an object's size in its header."""
 
+_MOST_TEXTS = 20  # different warnings of a library that are reported
+_LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
+_WITHOUT_DIRECTIONS = (".csv", ".db")
+_LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
+_MOST_BYTES = 64
+
+_READ_ERRORS = (
+    ValueError,  # text that is no number, a wrong file version
+    LookupError,
+    TypeError,
+    AttributeError,  # of None
+    ArithmeticError,  # infinite or huge times
+    EOFError,
+    OSError,
+    struct.error,
+    zlib.error,
+    sqlite3.Error,
+    BLFParseError,
+)
+"""What python-can's readers raise on a damaged file."""
+
 
 class CheckedBLFReader(BLFReader):
     """Messages of a BLF file; raises BLFParseError where a size can't be right."""
@@ -114,29 +135,6 @@ def _expanded(container: bytes, at: int) -> bytes:
             f"the container at byte {at} expands to more than {LARGEST_CONTAINER >> 20} MiB"
         )
     return expanded
-
-
-_MOST_TEXTS = 20  # different warnings of a library that are reported
-_LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
-_WITHOUT_DIRECTIONS = (".csv", ".db")
-_LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
-_MOST_BYTES = 64
-
-
-_READ_ERRORS = (
-    ValueError,  # text that is no number, a wrong file version
-    LookupError,
-    TypeError,
-    AttributeError,  # of None
-    ArithmeticError,  # infinite or huge times
-    EOFError,
-    OSError,
-    struct.error,
-    zlib.error,
-    sqlite3.Error,
-    BLFParseError,
-)
-"""What python-can's readers raise on a damaged file."""
 
 
 @contextmanager

@@ -51,6 +51,12 @@ _OPTION_FORM = (
 STATES = "states"
 COMMANDS = "commands"
 
+_WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+"""What stands beside a position of the same row."""
+
+_MOST_PARTS = 100
+"""Sets of joints that have a value together; in further ones the others have NaN."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -242,13 +248,6 @@ def _note_repeated(faults: Faults, columns: Sequence[Column]) -> None:
     targets = [f"{column.joint}.{column.quantity}" for column in columns]
     for target in sorted({target for target in targets if targets.count(target) > 1}):
         faults.add("columns", f"{targets.count(target)} columns for {target}", "one at most")
-
-
-_WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
-"""What stands beside a position of the same row."""
-
-_MOST_PARTS = 100
-"""Sets of joints that have a value together; in further ones the others have NaN."""
 
 
 def topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:

@@ -57,6 +57,9 @@ _FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
 _FD_NAMES = {"length code": "length"}
 """Names that differ for CAN FD frames."""
 
+_MOST_TOPICS = 500
+_ROWS_PER_BLOCK = 100_000
+
 
 class LossTally:
     """Count of the facts that are lost from a session to a format."""
@@ -176,10 +179,6 @@ def chosen_format(
         raise UsageError(f"{output} is the session itself; choose another name")
     refuse_existing(output, force=force)
     return formats[output.suffix.lower()]
-
-
-_MOST_TOPICS = 500
-_ROWS_PER_BLOCK = 100_000
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,9 @@ SCHEMA = (
 
 _STAMP_END_NS = 2**31 * NS
 
+_BLF_EPOCH_NS = 631_152_000 * NS  # 1990: python-can takes less for no date
+_NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
+
 
 def _ros_notes(facts: FrameFacts) -> Iterator[str]:
     """Report changed bus names, missing directions and times after 2038."""
@@ -142,10 +145,6 @@ def _namespace(bus: str) -> str:
 
 WriteFrames = Callable[[LogBlock], None]
 """Writes a part of a log; CAN FD frames only where the format holds them."""
-
-
-_BLF_EPOCH_NS = 631_152_000 * NS  # 1990: python-can takes less for no date
-_NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,9 @@ FRAMES_PER_BLOCK = 65_536
 DIRECTIONS_KEY = "import.directions"
 """Metadata key: ``recorded``, or ``none`` for a log without directions."""
 
+_MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
+_LATEST_NS = 1_000_000_000  # a frame is logged at most this long after its time
+
 
 class FrameRow(NamedTuple):
     """One frame of a log.
@@ -200,10 +203,6 @@ def is_error(frames: FrameArray) -> BoolArray:
 def is_remote(frames: FrameArray) -> BoolArray:
     """Return which frames are remote frames and not error frames, shape (n,)."""
     return ((frames["id_flags"] & wire.REMOTE_FLAG) != 0) & ~is_error(frames)
-
-
-_MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
-_LATEST_NS = 1_000_000_000  # a frame is logged at most this long after its time
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,15 @@ from ..log.messages import frames as wire
 from ..log.messages.frames import empty_fd_frames
 from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
 
+_KIND_FLAGS = {
+    "CAN_DataFrame": 0,
+    "CAN_RemoteFrame": wire.REMOTE_FLAG,
+    "CAN_ErrorFrame": wire.ERROR_FLAG,
+}
+_LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
+_PLACES: IntArray = np.arange(64)
+_VERSION_4 = (b"MDF", b"UnFinMF")
+
 
 @contextmanager
 def _readable(path: Path, what: str) -> Generator[None]:
@@ -87,16 +96,6 @@ def _noted(problems: list[str]) -> Generator[None]:
         yield
     finally:
         logger.removeFilter(saying)
-
-
-_KIND_FLAGS = {
-    "CAN_DataFrame": 0,
-    "CAN_RemoteFrame": wire.REMOTE_FLAG,
-    "CAN_ErrorFrame": wire.ERROR_FLAG,
-}
-_LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
-_PLACES: IntArray = np.arange(64)
-_VERSION_4 = (b"MDF", b"UnFinMF")
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,8 @@ _SNIFFED = 1 << 16
 _TRACKS = "scorer"
 """First cell of a file of DeepLabCut."""
 
+_TIMES = ("time", "timestamp", "stamp", "t", "secs", "seconds", "epoch", "ts", "datetime")
+
 
 @dataclass(frozen=True)
 class TableFile:
@@ -441,9 +443,6 @@ def _wide(
             dense[row[known] - at, codes[known]] = numbers[known]
             block |= {f"{value}[{name}]": dense[:, i] for i, name in enumerate(names)}
         yield {name: block[name] for name in wanted}
-
-
-_TIMES = ("time", "timestamp", "stamp", "t", "secs", "seconds", "epoch", "ts", "datetime")
 
 
 def words(name: str) -> list[str]:

@@ -41,6 +41,9 @@ from .file.parts import first_part
 from .messages.definitions import adds_up, is_latched
 from .wal.writer import wal_folder
 
+RECOVERED_RECORD = "undulog.recovered"
+"""Metadata record of the sources of a recovered log."""
+
 
 def cut_log(
     path: Path,
@@ -191,10 +194,6 @@ def _copy_records(source: RawLog, log: EditedLog) -> None:
         log.note(name, record.metadata)
     for attachment in source.attachments:
         log.attach(attachment, attachment.name)
-
-
-RECOVERED_RECORD = "undulog.recovered"
-"""Metadata record of the sources of a recovered log."""
 
 
 @dataclass

@@ -38,6 +38,14 @@ _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, pu
 _BODY_AT = PREFIX_SIZE + _FIXED.size
 FOREVER_NS = 1 << 64
 
+EDIT_RECORD = "undulog.edit"
+"""Metadata record of the sources of an edited log."""
+HEALTH_RECORD = "undulog.health"
+_MOST_CHANNELS = 2**16 - 1
+_MOST_GROUPS = 128
+"""Of topics with chunks of their own, each of which takes up to a chunk's bytes of memory."""
+_STOP_CHECKED_EVERY = 1024
+
 
 class RawMessage(NamedTuple):
     """One message as it is stored.
@@ -204,15 +212,6 @@ def _robot_name(log_file: LogFile) -> str:
         with suppress(ValueError):
             return str(read_toml(attached.data.decode()).get("name", ""))
     return ""
-
-
-EDIT_RECORD = "undulog.edit"
-"""Metadata record of the sources of an edited log."""
-HEALTH_RECORD = "undulog.health"
-_MOST_CHANNELS = 2**16 - 1
-_MOST_GROUPS = 128
-"""Of topics with chunks of their own, each of which takes up to a chunk's bytes of memory."""
-_STOP_CHECKED_EVERY = 1024
 
 
 @dataclass

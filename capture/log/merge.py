@@ -49,6 +49,12 @@ Record = tuple[str, dict[str, str]]
 
 _SESSION_RECORD = "undulog"
 
+LONGEST_MERGE_GAP_S = 86400.0
+"""Logs with a longer time between them are merged only on request [s]: one of them is of another
+day's session, or a clock was wrong."""
+
+_LATER_S = 60.0
+
 
 def copy_records(
     sources: Sequence[RawLog], log: EditedLog, robot: str, warnings: list[str]
@@ -151,13 +157,6 @@ def _reasons(health: dict[str, str] | None) -> list[str]:
     if health is None:
         return ["states no verdict"]
     return [health.get("verdict", "no verdict"), *stated_reasons(health)]
-
-
-LONGEST_MERGE_GAP_S = 86400.0
-"""Logs with a longer time between them are merged only on request [s]: one of them is of another
-day's session, or a clock was wrong."""
-
-_LATER_S = 60.0
 
 
 def merge_logs(

@@ -36,6 +36,14 @@ from ..sources.serial_port import SerialSource
 from .settings import RecordSettings
 from .source_clock import SourceClock
 
+_FRAMES_PER_MESSAGE = 4096
+_FRAMES_PER_SLICE = 1024
+_FEWEST = 256  # with fewer, each frame costs more
+_LONG_NS = 12_000_000  # processor time of a slice: half as many frames next time
+_SHORT_NS = 6_000_000  # twice as many
+_PIECES = 8
+_MOST_FAILURES = 16  # single frames in a row; then the rest of the slice is not tried
+
 
 def robot_of(settings: RecordSettings, sources: Sequence[Source]) -> Robot | None:
     """Return the robot of the settings, or that of a source, or None.
@@ -89,15 +97,6 @@ def decoded_source(
             "others are kept raw"
         )
     return buses[0] if buses else None
-
-
-_FRAMES_PER_MESSAGE = 4096
-_FRAMES_PER_SLICE = 1024
-_FEWEST = 256  # with fewer, each frame costs more
-_LONG_NS = 12_000_000  # processor time of a slice: half as many frames next time
-_SHORT_NS = 6_000_000  # twice as many
-_PIECES = 8
-_MOST_FAILURES = 16  # single frames in a row; then the rest of the slice is not tried
 
 
 class BusRecorder:

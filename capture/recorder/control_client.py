@@ -35,6 +35,9 @@ LOCK_PATIENCE_S = 2.0
 Identity = tuple[int, int]
 """Device and inode of a socket file."""
 
+PATIENCE_S = 10.0
+"""Default time limit of a reply [s]: a recorder answers within a few ticks."""
+
 
 def socket_folder(environ: Mapping[str, str]) -> Path:
     """Return the folder of the sockets of all recorders of this user.
@@ -182,10 +185,6 @@ def _locked(folder: Path, patience_s: float) -> Generator[None]:
         yield
     finally:
         os.close(handle)
-
-
-PATIENCE_S = 10.0
-"""Default time limit of a reply [s]: a recorder answers within a few ticks."""
 
 
 class ControlClient:

@@ -45,6 +45,19 @@ from .live_wire import (
 
 _GRACE_S = 3.0
 
+RENEW_NS = 2_000_000_000
+"""Interval of sending all definitions again, and of looking up the path again [ns]."""
+RETRY_NS = 500_000_000
+"""Interval of looking for a relay [ns]."""
+
+_BUDGET_NS = 300_000
+_FILL_NS = 20_000_000
+_FILL = 16 << 10
+_DATAGRAM = 32 << 10
+_END_TRIES = 20
+_END_PAUSE_S = 0.005
+_NEVER_NS = 1 << 63
+
 
 class RelayProcess:
     """A running relay, with its viewer if it has one."""
@@ -121,20 +134,6 @@ def spawn_relay(path: Path, arguments: Sequence[str] = ()) -> RelayProcess:
     finally:
         os.close(handle)
     return RelayProcess(process, Path(name))
-
-
-RENEW_NS = 2_000_000_000
-"""Interval of sending all definitions again, and of looking up the path again [ns]."""
-RETRY_NS = 500_000_000
-"""Interval of looking for a relay [ns]."""
-
-_BUDGET_NS = 300_000
-_FILL_NS = 20_000_000
-_FILL = 16 << 10
-_DATAGRAM = 32 << 10
-_END_TRIES = 20
-_END_PAUSE_S = 0.005
-_NEVER_NS = 1 << 63
 
 
 @dataclass

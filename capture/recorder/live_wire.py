@@ -46,6 +46,20 @@ RECORD_SIZE = _RECORD.size
 MAX_MESSAGE = MAX_DATAGRAM - HEAD_SIZE - RECORD_SIZE
 """Longest payload of a message [byte]."""
 
+_STREAMS = {
+    "sensor_msgs/msg/JointState",
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/Range",
+    "sensor_msgs/msg/MagneticField",
+    "tf2_msgs/msg/TFMessage",
+    "sensor_msgs/msg/TimeReference",
+}
+"""Types of samples, whose rate may be reduced."""
+
+_STATES = {"std_msgs/msg/String"}
+"""Types published on change, whose last message is sent to a new relay."""
+
 
 class Kind(IntEnum):
     """Content of a datagram."""
@@ -163,21 +177,6 @@ def _description(kind: int, payload: bytes) -> Definition:
         return unpack_definition(kind, body)
     except (zlib.error, struct.error, McapError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"a definition of the live feed can't be read: {error}") from error
-
-
-_STREAMS = {
-    "sensor_msgs/msg/JointState",
-    "nav_msgs/msg/Odometry",
-    "sensor_msgs/msg/Imu",
-    "sensor_msgs/msg/Range",
-    "sensor_msgs/msg/MagneticField",
-    "tf2_msgs/msg/TFMessage",
-    "sensor_msgs/msg/TimeReference",
-}
-"""Types of samples, whose rate may be reduced."""
-
-_STATES = {"std_msgs/msg/String"}
-"""Types published on change, whose last message is sent to a new relay."""
 
 
 class LiveDefinitions:

@@ -73,6 +73,14 @@ TOPIC_COLUMNS = (
     Column("joints", 20, left=True, spare=1),
 )
 
+LINE_EVERY_S = 10.0
+"""Interval of the lines without a terminal [s]."""
+
+PATIENCE_S = 1.0
+"""Longest wait for the drawing thread at the end of a recording [s]."""
+
+_PRINTED = ("warn", "error", "fatal")
+
 
 def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = None) -> Text:
     """Draw a recording.
@@ -287,15 +295,6 @@ def _shorter(path: str, width: int) -> str:
         return path
     ends = (path[k:] for k in range(max(1, len(path) - width), len(path) + 1))
     return "…" + next(end for end in ends if cell_len(end) < width)
-
-
-LINE_EVERY_S = 10.0
-"""Interval of the lines without a terminal [s]."""
-
-PATIENCE_S = 1.0
-"""Longest wait for the drawing thread at the end of a recording [s]."""
-
-_PRINTED = ("warn", "error", "fatal")
 
 
 class Terminal:

@@ -53,6 +53,15 @@ _Number = TypeVar("_Number", int, float)
 _YES, _NO = ("true", "1", "yes", "on"), ("false", "0", "no", "off")
 _FACT = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 
+ENVIRONMENT_PREFIX = "UNDULOG_RECORD_"
+"""Begins the name of every environment variable that is a setting."""
+
+FILE_VARIABLE = f"{ENVIRONMENT_PREFIX}SETTINGS"
+"""Names the settings file unless the command line does."""
+
+DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
+"""A recording ends in good order when less disk is free [B]."""
+
 
 def _flag(value: object) -> bool:
     if isinstance(value, bool):
@@ -147,15 +156,6 @@ def _read_by(parse: Callable[[object], Any]) -> Mapping[str, Callable[[object], 
 
 
 _AT_LEAST_1_S = _read_by(_at_least(parse_duration_s, 1.0, "a duration of at least 1s"))
-
-ENVIRONMENT_PREFIX = "UNDULOG_RECORD_"
-"""Begins the name of every environment variable that is a setting."""
-
-FILE_VARIABLE = f"{ENVIRONMENT_PREFIX}SETTINGS"
-"""Names the settings file unless the command line does."""
-
-DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
-"""A recording ends in good order when less disk is free [B]."""
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,23 @@ STEP_SPREADS = 10.0
 STEP_BUCKETS = 10
 """Number of consecutive points above the line for a step: a loaded host is late for a while."""
 
+JUMP_NS = 100_000_000
+"""A device clock whose time decreases by more than this, or is this much too early, was set or
+restarted [ns]: no bus reorders its frames so far."""
+
+_START_JUMP_NS = 1_000_000_000.0
+"""The same before the rate is known, while a backlog may be processed."""
+
+SILENCE_NS = 120_000_000_000
+"""After a longer silence the offset is measured anew and only the rate is kept [ns]: a quartz
+drifts by more meanwhile than the line's uncertainty."""
+
+_WANDER = 2e-6  # of a rate over a silence
+
+_BINS_PER_OCTAVE = 8
+_BINS = 64 * _BINS_PER_OCTAVE
+_DELAYS = 4096
+
 
 @dataclass(frozen=True)
 class Line:
@@ -182,24 +199,6 @@ def _edge_rate(points: list[tuple[float, float]]) -> float:
 
 def _turns_down(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
     return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])
-
-
-JUMP_NS = 100_000_000
-"""A device clock whose time decreases by more than this, or is this much too early, was set or
-restarted [ns]: no bus reorders its frames so far."""
-
-_START_JUMP_NS = 1_000_000_000.0
-"""The same before the rate is known, while a backlog may be processed."""
-
-SILENCE_NS = 120_000_000_000
-"""After a longer silence the offset is measured anew and only the rate is kept [ns]: a quartz
-drifts by more meanwhile than the line's uncertainty."""
-
-_WANDER = 2e-6  # of a rate over a silence
-
-_BINS_PER_OCTAVE = 8
-_BINS = 64 * _BINS_PER_OCTAVE
-_DELAYS = 4096
 
 
 @dataclass(frozen=True)

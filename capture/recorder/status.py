@@ -20,6 +20,23 @@ from ..log.messages.definitions import ERROR, OK, STALE, WARN, DiagnosticStatus
 from ..log.messages.frames import FRAME_TOPIC_PREFIXES
 from .source_clock import ClockEstimate
 
+_PER_DECADE = 40
+_EDGES_NS = [round(1e3 * 10 ** (k / _PER_DECADE)) for k in range(7 * _PER_DECADE + 1)]
+
+SLOW_TICK_S = 0.05
+"""Ticks of 5 ms whose 99 % point is over this: the computer can't keep up."""
+
+LOW_TIME_S = 600.0
+"""Disk for less than this is a warning."""
+
+NO_TIME_S = 60.0
+"""Disk for less than this is an error."""
+
+SILENT_S = 1.0
+"""A source without a frame for longer is stale [s]; ``log check`` reports a silence."""
+
+_REASONS = 8
+
 
 class SessionClock:
     """Unix time at the start plus monotonic time since.
@@ -58,10 +75,6 @@ class EachSecond:
         late = now_ns - self._due_ns[k] >= NS
         self._due_ns[k] = now_ns + NS if late else self._due_ns[k] + NS
         self._tasks[k]()
-
-
-_PER_DECADE = 40
-_EDGES_NS = [round(1e3 * 10 ** (k / _PER_DECADE)) for k in range(7 * _PER_DECADE + 1)]
 
 
 @dataclass(frozen=True)
@@ -231,21 +244,6 @@ class RecorderSnapshot:
         if self.free is None or not self.byte_rate or self.byte_rate <= 0.0:
             return None
         return self.free / self.byte_rate
-
-
-SLOW_TICK_S = 0.05
-"""Ticks of 5 ms whose 99 % point is over this: the computer can't keep up."""
-
-LOW_TIME_S = 600.0
-"""Disk for less than this is a warning."""
-
-NO_TIME_S = 60.0
-"""Disk for less than this is an error."""
-
-SILENT_S = 1.0
-"""A source without a frame for longer is stale [s]; ``log check`` reports a silence."""
-
-_REASONS = 8
 
 
 def statuses(snapshot: RecorderSnapshot) -> tuple[DiagnosticStatus, ...]:

@@ -21,6 +21,15 @@ from ..common.errors import UsageError
 _LONGEST_STATUS = 512
 _WATCHDOG_PART = 0.5  # of the time after which the manager gives us up, as sd_notify(3) advises
 
+UNIT_NAME = "undulog-record@.service"
+"""File name of the unit; the part after the @ names the settings."""
+
+HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
+"""Folders that the unit hides from the recorder."""
+
+_REFUSED = "\"'\\*?["  # not allowed in a program's name by systemd
+_SHIPPED_PROGRAM = "/usr/local/bin/undulog"
+
 
 class Notifier:
     """Notifies the service manager, if there is one.
@@ -108,16 +117,6 @@ def _watchdog_ns(environ: Mapping[str, str]) -> int | None:
     if owner and owner != str(os.getpid()):
         return None  # inherited, for another process
     return int(text) * 1000 if text.isascii() and text.isdigit() and int(text) > 0 else None
-
-
-UNIT_NAME = "undulog-record@.service"
-"""File name of the unit; the part after the @ names the settings."""
-
-HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
-"""Folders that the unit hides from the recorder."""
-
-_REFUSED = "\"'\\*?["  # not allowed in a program's name by systemd
-_SHIPPED_PROGRAM = "/usr/local/bin/undulog"
 
 
 def unit_text(program: Path) -> str:

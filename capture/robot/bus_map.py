@@ -24,6 +24,49 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
+_STANDARD_GRAVITY = 9.80665  # m/s^2, 3rd CGPM 1901
+_TURN = 2 * math.pi
+
+_FACTORS: dict[str, dict[str, float]] = {
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": _TURN},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rev/s": _TURN, "rpm": _TURN / 60},
+    "N m": {"N m": 1.0, "mN m": 1e-3, "kgf cm": _STANDARD_GRAVITY / 100},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "V": {"V": 1.0, "mV": 1e-3},
+    "degC": {"degC": 1.0, "K": 1.0},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s^2": {"m/s^2": 1.0, "g": _STANDARD_GRAVITY, "mg": _STANDARD_GRAVITY / 1000},
+    "T": {"T": 1.0, "uT": 1e-6, "G": 1e-4},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}
+
+TIME_UNITS: dict[str, int] = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+"""Nanoseconds in each unit of time."""
+
+SESSION_UNIT: dict[Quantity, str] = {
+    Quantity.COMMAND: "rad",
+    Quantity.POSITION: "rad",
+    Quantity.VELOCITY: "rad/s",
+    Quantity.EFFORT: "N m",
+    Quantity.CURRENT: "A",
+    Quantity.VOLTAGE: "V",
+    Quantity.TEMPERATURE: "degC",
+    Quantity.RANGE: "m",
+    Quantity.ACCELERATION: "m/s^2",
+    Quantity.MAGNETIC_FIELD: "T",
+}
+"""The unit in which a session holds each quantity."""
+
+_PLACEHOLDER = "{joint}"
+_OF_SENSOR = {
+    SensorKind.IR: Quantity.RANGE,
+    SensorKind.SONAR: Quantity.RANGE,
+    SensorKind.ACCELEROMETER: Quantity.ACCELERATION,
+    SensorKind.COMPASS: Quantity.MAGNETIC_FIELD,
+}
+JOINT_QUANTITIES = tuple(q for q in Quantity if q not in _OF_SENSOR.values())
+"""What can be known of a joint."""
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -45,44 +88,12 @@ class Unit:
         return scaled + self.offset if self.offset else scaled  # keeps -0.0
 
 
-_STANDARD_GRAVITY = 9.80665  # m/s^2, 3rd CGPM 1901
-_TURN = 2 * math.pi
-
-_FACTORS: dict[str, dict[str, float]] = {
-    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": _TURN},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rev/s": _TURN, "rpm": _TURN / 60},
-    "N m": {"N m": 1.0, "mN m": 1e-3, "kgf cm": _STANDARD_GRAVITY / 100},
-    "A": {"A": 1.0, "mA": 1e-3},
-    "V": {"V": 1.0, "mV": 1e-3},
-    "degC": {"degC": 1.0, "K": 1.0},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "m/s^2": {"m/s^2": 1.0, "g": _STANDARD_GRAVITY, "mg": _STANDARD_GRAVITY / 1000},
-    "T": {"T": 1.0, "uT": 1e-6, "G": 1e-4},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-}
 UNITS: dict[str, Unit] = {
     name: Unit(dimension, factor, -273.15 if name == "K" else 0.0)
     for dimension, factors in _FACTORS.items()
     for name, factor in factors.items()
 }
 """Every unit that a robot description or a column map may name."""
-
-TIME_UNITS: dict[str, int] = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-"""Nanoseconds in each unit of time."""
-
-SESSION_UNIT: dict[Quantity, str] = {
-    Quantity.COMMAND: "rad",
-    Quantity.POSITION: "rad",
-    Quantity.VELOCITY: "rad/s",
-    Quantity.EFFORT: "N m",
-    Quantity.CURRENT: "A",
-    Quantity.VOLTAGE: "V",
-    Quantity.TEMPERATURE: "degC",
-    Quantity.RANGE: "m",
-    Quantity.ACCELERATION: "m/s^2",
-    Quantity.MAGNETIC_FIELD: "T",
-}
-"""The unit in which a session holds each quantity."""
 
 
 @lru_cache
@@ -102,17 +113,6 @@ def unit_for(name: str, quantity: Quantity) -> Unit:
     if name not in valid:
         raise UsageError(f"unit {name!r} does not fit {quantity}; valid: {', '.join(valid)}")
     return UNITS[name]
-
-
-_PLACEHOLDER = "{joint}"
-_OF_SENSOR = {
-    SensorKind.IR: Quantity.RANGE,
-    SensorKind.SONAR: Quantity.RANGE,
-    SensorKind.ACCELEROMETER: Quantity.ACCELERATION,
-    SensorKind.COMPASS: Quantity.MAGNETIC_FIELD,
-}
-JOINT_QUANTITIES = tuple(q for q in Quantity if q not in _OF_SENSOR.values())
-"""What can be known of a joint."""
 
 
 def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str, Message] | None:

@@ -54,14 +54,19 @@ from .model import (
     Servo,
 )
 
+_LONGEST_CHAIN = 1000  # joints of a chain given by its length; more are a typing error
+
+_RANGED = (SensorKind.IR, SensorKind.SONAR)
+_RANGE_FIELDS = ("range_min", "range_max", "field_of_view")
+
+_SHELF = Shelf("robot", "undulog.capture.robot", "shipped", RobotFileError)
+_PARTS = ("links", "joints", "servo", "sensors", "bus")
+
 
 def _note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
     """Note names that occur more than once; empty ones are faults already."""
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         faults.add(what, f"{names.count(name)} times {name}", "every name once")
-
-
-_LONGEST_CHAIN = 1000  # joints of a chain given by its length; more are a typing error
 
 
 def _read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
@@ -149,10 +154,6 @@ def _read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
     return replace(safety, of=tuple(of))
 
 
-_RANGED = (SensorKind.IR, SensorKind.SONAR)
-_RANGE_FIELDS = ("range_min", "range_max", "field_of_view")
-
-
 def _read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[Sensor, ...]:
     """Read ``sensors``, with ``defaults`` of each kind."""
     common = {kind: defaults.table(kind) for kind in SensorKind}
@@ -197,10 +198,6 @@ def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
     sensor = replace(sensor, assumed=table.words("assumed", valid=fields))
     table.close()
     return sensor
-
-
-_SHELF = Shelf("robot", "undulog.capture.robot", "shipped", RobotFileError)
-_PARTS = ("links", "joints", "servo", "sensors", "bus")
 
 
 def robot_names() -> tuple[str, ...]:

@@ -23,6 +23,39 @@ from .serial_servos import SERVOS
 
 TX, RX = Direction.TX, Direction.RX
 
+_DAMIAO: Mapping[str, tuple[float, float, float]] = {
+    "dm4310": (12.5, 30, 10), "dm4310-48v": (12.5, 50, 10), "dm4340": (12.5, 8, 28),
+    "dm4340-48v": (12.5, 10, 28), "dm6006": (12.5, 45, 20), "dm8006": (12.5, 45, 40),
+    "dm8009": (12.5, 45, 54), "dm10010l": (12.5, 25, 200), "dm10010": (12.5, 20, 200),
+    "dmh3510": (12.5, 280, 1), "dmh6215": (12.5, 45, 10), "dmg6220": (12.5, 45, 10),
+}  # fmt: skip
+"""Model to PMAX [rad], VMAX [rad/s], TMAX [N m], as DM_Control_Python lists them; all three are
+settings of the motor."""
+
+_AK: Mapping[str, tuple[float, float, float]] = {
+    "ak10-9": (12.5, 50, 65), "ak60-6": (12.5, 45, 15), "ak70-10": (12.5, 50, 25),
+    "ak80-6": (12.5, 76, 12), "ak80-9": (12.5, 50, 18), "ak80-64": (12.5, 8, 144),
+    "ak80-8": (12.5, 37.5, 32),
+}  # fmt: skip
+"""Model to ranges of position [rad], velocity [rad/s] and torque [N m]: AK series manual."""
+
+_ROBSTRIDE: Mapping[str, tuple[float, float, float]] = {
+    "cybergear": (4 * math.pi, 30, 12),
+    "rs00": (4 * math.pi, 33, 14), "rs01": (4 * math.pi, 44, 17), "rs02": (4 * math.pi, 44, 17),
+    "rs03": (4 * math.pi, 20, 60), "rs04": (4 * math.pi, 15, 120), "rs05": (4 * math.pi, 50, 5.5),
+    "rs06": (4 * math.pi, 50, 36),
+}  # fmt: skip
+"""Model to ranges of position [rad], velocity [rad/s] and torque [N m]: the motors' manuals."""
+
+_RMD_STATE = (0x9C, *range(0xA1, 0xAA))
+
+DECODERS = "undulog.decoders"
+"""Entry point group: the name is a family, the object a class with the methods of
+:class:`.capture.bus.decoding.Decoder`, called with the robot."""
+
+_SCALED = (Quantity.COMMAND, Quantity.POSITION, Quantity.VELOCITY)
+_DEFAULT_BITRATE = 1_000_000
+
 
 @dataclass(frozen=True)
 class Field:
@@ -128,16 +161,6 @@ def _mit_reply(
     return Frame("reply", RX, id_, fields, "0|4@1+" if low_nibble else "0|8@1+")
 
 
-_DAMIAO: Mapping[str, tuple[float, float, float]] = {
-    "dm4310": (12.5, 30, 10), "dm4310-48v": (12.5, 50, 10), "dm4340": (12.5, 8, 28),
-    "dm4340-48v": (12.5, 10, 28), "dm6006": (12.5, 45, 20), "dm8006": (12.5, 45, 40),
-    "dm8009": (12.5, 45, 54), "dm10010l": (12.5, 25, 200), "dm10010": (12.5, 20, 200),
-    "dmh3510": (12.5, 280, 1), "dmh6215": (12.5, 45, 10), "dmg6220": (12.5, 45, 10),
-}  # fmt: skip
-"""Model to PMAX [rad], VMAX [rad/s], TMAX [N m], as DM_Control_Python lists them; all three are
-settings of the motor."""
-
-
 def damiao(motor: Motor) -> tuple[Frame, ...]:
     """Damiao: MIT mode, position-velocity mode (0x100 + id), replies at the master's identifier."""
     most = _DAMIAO[motor.model]
@@ -151,28 +174,11 @@ def damiao(motor: Motor) -> tuple[Frame, ...]:
     )
 
 
-_AK: Mapping[str, tuple[float, float, float]] = {
-    "ak10-9": (12.5, 50, 65), "ak60-6": (12.5, 45, 15), "ak70-10": (12.5, 50, 25),
-    "ak80-6": (12.5, 76, 12), "ak80-9": (12.5, 50, 18), "ak80-64": (12.5, 8, 144),
-    "ak80-8": (12.5, 37.5, 32),
-}  # fmt: skip
-"""Model to ranges of position [rad], velocity [rad/s] and torque [N m]: AK series manual."""
-
-
 def tmotor_ak(motor: Motor) -> tuple[Frame, ...]:
     """T-Motor AK series in MIT mode."""
     most = _AK[motor.model]
     reply = _mit_reply(motor.reply_id or 0, motor.id, most, low_nibble=False, warmth=-40.0)
     return (_mit_command(motor.id, most[0], most[1]), reply)
-
-
-_ROBSTRIDE: Mapping[str, tuple[float, float, float]] = {
-    "cybergear": (4 * math.pi, 30, 12),
-    "rs00": (4 * math.pi, 33, 14), "rs01": (4 * math.pi, 44, 17), "rs02": (4 * math.pi, 44, 17),
-    "rs03": (4 * math.pi, 20, 60), "rs04": (4 * math.pi, 15, 120), "rs05": (4 * math.pi, 50, 5.5),
-    "rs06": (4 * math.pi, 50, 36),
-}  # fmt: skip
-"""Model to ranges of position [rad], velocity [rad/s] and torque [N m]: the motors' manuals."""
 
 
 def _robstride(motor: Motor) -> tuple[Frame, ...]:
@@ -198,9 +204,6 @@ def _robstride(motor: Motor) -> tuple[Frame, ...]:
             Field("temperature", "55|16@0+", Quantity.TEMPERATURE, "degC", 0.1),
         ), extended=True),
     )  # fmt: skip
-
-
-_RMD_STATE = (0x9C, *range(0xA1, 0xAA))
 
 
 def rmd(motor: Motor) -> tuple[Frame, ...]:
@@ -274,14 +277,6 @@ CAN_FAMILIES: Mapping[str, Family] = {
     "odrive": Family(odrive, bitrate=250_000),
 }
 """Every family on CAN whose frames a DBC can describe."""
-
-
-DECODERS = "undulog.decoders"
-"""Entry point group: the name is a family, the object a class with the methods of
-:class:`.capture.bus.decoding.Decoder`, called with the robot."""
-
-_SCALED = (Quantity.COMMAND, Quantity.POSITION, Quantity.VELOCITY)
-_DEFAULT_BITRATE = 1_000_000
 
 
 def family_names() -> tuple[str, ...]:

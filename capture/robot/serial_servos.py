@@ -21,6 +21,24 @@ from typing import NamedTuple
 
 from .model import Direction, Quantity
 
+_TURN = 2 * math.pi
+_STEP = _TURN / 4096  # 12 bits a turn
+_RPM = 0.229  # rev/min, the velocity unit of the X series
+
+_SCS_STEP = math.radians(300) / 1024
+
+PING, READ, WRITE, REG_WRITE, ACTION = 1, 2, 3, 4, 5
+STATUS, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x55, 0x82, 0x83, 0x92, 0x93
+BROADCAST = 0xFE
+"""Instructions, and the identifier that all servos take for their own."""
+
+STUFFED, PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
+
+MORE, FAULTY = -1, 0
+"""A judgement: more bytes are needed; no packet begins here."""
+
+_LONGEST = 4096  # of a Dynamixel packet; its length field holds 65535
+
 
 @dataclass(frozen=True)
 class Register:
@@ -70,10 +88,6 @@ class Register:
         return number.to_bytes(self.size, order, signed=self.signed)
 
 
-_TURN = 2 * math.pi
-_STEP = _TURN / 4096  # 12 bits a turn
-_RPM = 0.229  # rev/min, the velocity unit of the X series
-
 _STS = (
     Register("goal_position", 42, 2, Quantity.COMMAND, "rad", _STEP, -math.pi, 15),
     Register("present_position", 56, 2, Quantity.POSITION, "rad", _STEP, -math.pi, 15),
@@ -82,7 +96,6 @@ _STS = (
     Register("present_temperature", 63, 1, Quantity.TEMPERATURE, "degC", 1.0),
     Register("present_current", 69, 2, Quantity.CURRENT, "mA", 6.5, 0.0, 15),
 )
-_SCS_STEP = math.radians(300) / 1024
 _SCS = tuple(
     replace(register, big_endian=True, scale=_SCS_STEP, offset=-512 * _SCS_STEP)
     if register.unit == "rad"
@@ -120,14 +133,6 @@ SERVOS: Mapping[str, Mapping[str, tuple[Register, ...]]] = {
 """Protocol to model to registers. Angle 0 is the middle of the range, as the servos have it."""
 
 
-PING, READ, WRITE, REG_WRITE, ACTION = 1, 2, 3, 4, 5
-STATUS, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x55, 0x82, 0x83, 0x92, 0x93
-BROADCAST = 0xFE
-"""Instructions, and the identifier that all servos take for their own."""
-
-STUFFED, PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-
-
 def _crc_table() -> tuple[int, ...]:
     table: list[int] = []
     for byte in range(256):
@@ -161,9 +166,6 @@ def dynamixel_packet(servo: int, instruction: int, parameters: bytes = b"") -> b
     whole = b"\xff\xff\xfd\x00" + bytes((servo,)) + (len(body) + 2).to_bytes(2, "little") + body
     return whole + crc16(whole).to_bytes(2, "little")
 
-
-MORE, FAULTY = -1, 0
-"""A judgement: more bytes are needed; no packet begins here."""
 
 Judge = Callable[[bytes, int, bool], int]
 """Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY; with the
@@ -199,9 +201,6 @@ def _feetech(data: bytes, at: int, ended: bool, known: dict[int, int]) -> int:  
             return FAULTY
         inside = data.find(b"\xff\xff", inside + 1, stop)
     return size
-
-
-_LONGEST = 4096  # of a Dynamixel packet; its length field holds 65535
 
 
 def _judge_dynamixel(data: bytes, at: int, ended: bool) -> int:  # noqa: ARG001

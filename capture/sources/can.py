@@ -41,6 +41,51 @@ _JOIN_S = 1.0
 _MOST_HELD = 1_000_000
 _TIMES_END_S = DEVICE_TIMES_END_NS / 1e9
 
+LISTEN_ONLY: Mapping[str, Mapping[str, object]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},  # DRIVER_MODE_SILENT
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "systec": {"state": can.BusState.PASSIVE},
+    "vector": {"listen_only": True},
+}
+"""Interface to the options that make its controller listen only (slcan: its L command)."""
+
+NO_CONTROLLER = frozenset({"virtual", "udp_multicast", "socketcan", "socketcand"})
+"""Interfaces that open no controller: there is nothing to make listen only."""
+
+DEVICE_TIME = frozenset(
+    {
+        "canalystii",
+        "etas",
+        "ixxat",
+        "kvaser",
+        "neovi",
+        "nican",
+        "nixnet",
+        "pcan",
+        "serial",
+        "systec",
+        "vector",
+    }
+)
+"""Interfaces whose messages carry the device's own time, in seconds.
+
+The others stamp with the computer's wall clock, with a counter that starts again within the hour
+(gs_usb, cantact), or in another unit (usb2can): the recorder's own time of arrival is better.
+"""
+
+_TIMING = {"f_clock", "brp", "tseg1", "tseg2", "sjw", "nof_samples"}
+_COMMON = {"bitrate", "fd", "data_bitrate"}
+_PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
+
+_OWN_LINKS: Mapping[str, Callable[[SourceAddress, str], Source]] = {
+    "slcan": slcan_source,
+    "socketcand": socketcand_source,
+    "socketcan": socketcan_source,
+}
+
 
 def bus_class(text: str, interface: str) -> type[can.BusABC]:
     """Return the class of a known interface, e.g. ``pcan``.
@@ -211,46 +256,6 @@ def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) ->
         raise SourceError(text, f"python-can can't open it: {kind}: {error}") from error
 
 
-LISTEN_ONLY: Mapping[str, Mapping[str, object]] = {
-    "cantact": {"monitor": True},
-    "kvaser": {"driver_mode": False},  # DRIVER_MODE_SILENT
-    "nixnet": {"listen_only": True},
-    "pcan": {"state": can.BusState.PASSIVE},
-    "seeedstudio": {"operation_mode": "silent"},
-    "systec": {"state": can.BusState.PASSIVE},
-    "vector": {"listen_only": True},
-}
-"""Interface to the options that make its controller listen only (slcan: its L command)."""
-
-NO_CONTROLLER = frozenset({"virtual", "udp_multicast", "socketcan", "socketcand"})
-"""Interfaces that open no controller: there is nothing to make listen only."""
-
-DEVICE_TIME = frozenset(
-    {
-        "canalystii",
-        "etas",
-        "ixxat",
-        "kvaser",
-        "neovi",
-        "nican",
-        "nixnet",
-        "pcan",
-        "serial",
-        "systec",
-        "vector",
-    }
-)
-"""Interfaces whose messages carry the device's own time, in seconds.
-
-The others stamp with the computer's wall clock, with a counter that starts again within the hour
-(gs_usb, cantact), or in another unit (usb2can): the recorder's own time of arrival is better.
-"""
-
-_TIMING = {"f_clock", "brp", "tseg1", "tseg2", "sjw", "nof_samples"}
-_COMMON = {"bitrate", "fd", "data_bitrate"}
-_PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
-
-
 def interface_of(address: SourceAddress) -> tuple[str, str]:
     """Return interface and channel of an address.
 
@@ -321,13 +326,6 @@ def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
         clock=ClockDomain.DEVICE if device_time else ClockDomain.HOST,
         facts=facts,
     )
-
-
-_OWN_LINKS: Mapping[str, Callable[[SourceAddress, str], Source]] = {
-    "slcan": slcan_source,
-    "socketcand": socketcand_source,
-    "socketcan": socketcan_source,
-}
 
 
 def _converted(address: SourceAddress, key: str, value: str) -> object:

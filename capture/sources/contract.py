@@ -56,6 +56,24 @@ pack_fd_record = struct.Struct("<QQIBBBx64s").pack
 """Packs ``t_device_ns, t_host_ns, id_flags, len, dir, fd_flags, data`` as
 :data:`.capture.log.messages.frames.FD_FRAME_DTYPE` has them; data is filled with zeros."""
 
+ENTRY_POINTS = "undulog.sources"
+"""Entry point group: the name is the scheme, the object opens a source."""
+
+DEVICE_TIMES_END_NS = 1 << 62
+"""Device times lie below this [ns], 146 years. A frame with another one is kept and decoded, at an
+estimated time, and counts as malformed."""
+
+_YES = {"1", "true", "yes", "on"}
+_NO = {"0", "false", "no", "off"}
+
+FORM = "[NAME=]SCHEME:REST[?KEY=VALUE&...]"
+"""Form of an address, for messages."""
+
+_EXAMPLES = "can:socketcan:can0, can:slcan:/dev/ttyACM0?bitrate=1000000, unix:/run/snake.sock"
+_NAME = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*")
+_VALID_NAME = "a letter, then letters, digits and underscores, e.g. can0 or left_arm"
+_PREFIX = re.compile(r"([^:?=]*)=(.*)", re.DOTALL)
+
 
 def records(packed: Iterable[bytes]) -> FrameArray:
     """Join records of :data:`pack_record` into a writeable array, shape (n,).
@@ -68,14 +86,6 @@ def records(packed: Iterable[bytes]) -> FrameArray:
 def fd_records(packed: Iterable[bytes]) -> FrameArray:
     """Join records of :data:`pack_fd_record` into a writeable array, shape (n,)."""
     return np.frombuffer(bytearray().join(packed), dtype=FD_FRAME_DTYPE)
-
-
-ENTRY_POINTS = "undulog.sources"
-"""Entry point group: the name is the scheme, the object opens a source."""
-
-DEVICE_TIMES_END_NS = 1 << 62
-"""Device times lie below this [ns], 146 years. A frame with another one is kept and decoded, at an
-estimated time, and counts as malformed."""
 
 
 @dataclass(frozen=True)
@@ -241,10 +251,6 @@ class EndingSource(Protocol):
         """Accept no more frames. Those accepted come with the next polls; then it is finished."""
 
 
-_YES = {"1", "true", "yes", "on"}
-_NO = {"0", "false", "no", "off"}
-
-
 def only(address: SourceAddress, valid: Iterable[str]) -> None:
     """Check that an address has valid options only.
 
@@ -283,15 +289,6 @@ def flag(address: SourceAddress, key: str, *, default: bool) -> bool:
     if value.lower() not in _YES | _NO:
         raise UsageError(f"{address.text!r}: {key}={value} is neither 1 nor 0")
     return value.lower() in _YES
-
-
-FORM = "[NAME=]SCHEME:REST[?KEY=VALUE&...]"
-"""Form of an address, for messages."""
-
-_EXAMPLES = "can:socketcan:can0, can:slcan:/dev/ttyACM0?bitrate=1000000, unix:/run/snake.sock"
-_NAME = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*")
-_VALID_NAME = "a letter, then letters, digits and underscores, e.g. can0 or left_arm"
-_PREFIX = re.compile(r"([^:?=]*)=(.*)", re.DOTALL)
 
 
 def parse_address(text: str) -> SourceAddress:

@@ -20,6 +20,32 @@ IMPLAUSIBLE_TIME = "device time out of range, another is estimated"
 
 _PAUSE_NS = 1_000_000_000
 
+BUS_OFF = 0x40
+"""Error class: the controller left the bus."""
+RESTARTED = 0x100
+"""Error class: the controller is back."""
+
+_CLASSES = {
+    0x001: "transmit time-out",
+    0x002: "lost arbitration",
+    0x004: "controller problem",
+    0x008: "protocol violation",
+    0x010: "transceiver problem",
+    0x020: "no acknowledgement",
+    0x080: "bus error",
+    0x200: "error counters changed",
+}
+_CONTROLLER = 0x004
+_CONTROLLER_STATES = {
+    0x01: "receive buffer overflow",
+    0x02: "transmit buffer overflow",
+    0x04: "reception warning level",
+    0x08: "transmission warning level",
+    0x10: "reception error passive",
+    0x20: "transmission error passive",
+    0x40: "error active again",
+}
+
 
 @dataclass
 class _Repeats:
@@ -115,33 +141,6 @@ class Tally:
         if count:
             self.counts.malformed += count
             self.events.log_event("warn", text, count)
-
-
-BUS_OFF = 0x40
-"""Error class: the controller left the bus."""
-RESTARTED = 0x100
-"""Error class: the controller is back."""
-
-_CLASSES = {
-    0x001: "transmit time-out",
-    0x002: "lost arbitration",
-    0x004: "controller problem",
-    0x008: "protocol violation",
-    0x010: "transceiver problem",
-    0x020: "no acknowledgement",
-    0x080: "bus error",
-    0x200: "error counters changed",
-}
-_CONTROLLER = 0x004
-_CONTROLLER_STATES = {
-    0x01: "receive buffer overflow",
-    0x02: "transmit buffer overflow",
-    0x04: "reception warning level",
-    0x08: "transmission warning level",
-    0x10: "reception error passive",
-    0x20: "transmission error passive",
-    0x40: "error active again",
-}
 
 
 class BusWatch:

@@ -24,6 +24,18 @@ _FIRST_NS = 100_000_000
 _LONGEST_NS = 5_000_000_000
 _STEADY_NS = 1_000_000_000
 
+_FIRST_ATTEMPT_S = 0.5
+_ABSENT = {
+    errno.ENOENT,
+    errno.ENODEV,
+    errno.ENXIO,
+    errno.EIO,
+    errno.ENETDOWN,
+    errno.ECONNREFUSED,
+    errno.ECONNRESET,
+}
+"""Errors of an unplugged device or an ended server."""
+
 
 class Backoff:
     """Pauses between attempts: 0.1 s, doubled up to 5 s.
@@ -52,19 +64,6 @@ class Backoff:
         self._opened_ns = None
         self._due_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, _LONGEST_NS)
-
-
-_FIRST_ATTEMPT_S = 0.5
-_ABSENT = {
-    errno.ENOENT,
-    errno.ENODEV,
-    errno.ENXIO,
-    errno.EIO,
-    errno.ENETDOWN,
-    errno.ECONNREFUSED,
-    errno.ECONNRESET,
-}
-"""Errors of an unplugged device or an ended server."""
 
 
 class Link(Protocol):

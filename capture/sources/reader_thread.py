@@ -55,6 +55,20 @@ _CONTROL = 128
 _EMPTY = 2**32 - 1  # no packet has this size
 _SLACK_NS = 20_000_000
 
+_IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
+_HEAD = [("len", np.uintp), ("kind", "<u8")]  # level and type, compared as one
+_STAMP = np.dtype([*_HEAD, ("s", np.intp), ("ns", np.intp)])
+_DROPS = np.dtype([*_HEAD, ("count", "<u4")])
+_TIME_KIND = SO_TIMESTAMPNS << 32 | socket.SOL_SOCKET
+_DROPS_KIND = SO_RXQ_OVFL << 32 | socket.SOL_SOCKET
+_RECVMMSG = ctypes.CDLL(None, use_errno=True).recvmmsg
+
+_JOIN_S = 1.0
+_FEWEST, _MOST = 256, 1024  # rows; the kernel takes no more
+_BRIEF_S = 0.2  # rows that are full sooner become more
+_LAST_CALLS = 3  # without a packet: an error that waits in the socket, an interruption, the end
+_MOST_BYTES = 64 << 20  # so much may wait for the loop: then the kernel's buffer fills
+
 
 class _Mmsghdr(ctypes.Structure):
     """``struct mmsghdr`` with its ``struct msghdr`` in line; pointers as integers, for numpy."""
@@ -73,13 +87,6 @@ class _Mmsghdr(ctypes.Structure):
 
 
 _MMSGHDR = cast("np.dtype[np.void]", np.dtype(_Mmsghdr))
-_IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
-_HEAD = [("len", np.uintp), ("kind", "<u8")]  # level and type, compared as one
-_STAMP = np.dtype([*_HEAD, ("s", np.intp), ("ns", np.intp)])
-_DROPS = np.dtype([*_HEAD, ("count", "<u4")])
-_TIME_KIND = SO_TIMESTAMPNS << 32 | socket.SOL_SOCKET
-_DROPS_KIND = SO_RXQ_OVFL << 32 | socket.SOL_SOCKET
-_RECVMMSG = ctypes.CDLL(None, use_errno=True).recvmmsg
 
 
 @dataclass(frozen=True)
@@ -269,13 +276,6 @@ def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> N
         sock.setsockopt(socket.SOL_SOCKET, force, size)
     except PermissionError:
         sock.setsockopt(socket.SOL_SOCKET, option, size)
-
-
-_JOIN_S = 1.0
-_FEWEST, _MOST = 256, 1024  # rows; the kernel takes no more
-_BRIEF_S = 0.2  # rows that are full sooner become more
-_LAST_CALLS = 3  # without a packet: an error that waits in the socket, an interruption, the end
-_MOST_BYTES = 64 << 20  # so much may wait for the loop: then the kernel's buffer fills
 
 
 class _Rows:

@@ -49,6 +49,12 @@ _PAUSE_S = 0.0002
 _SILENCE_NS = 50_000_000  # no adapter holds bytes back for longer
 _OTHER = "another process (of another user, or one that took it for itself)"
 
+_TIOCGICOUNT = 0x545D
+_COUNTERS = struct.Struct("11i36x")
+"""``struct serial_icounter_struct`` (``linux/serial.h``): cts, dsr, rng, dcd, rx, tx, frame,
+overrun, parity, brk, buf_overrun, and nine reserved."""
+_OVERRUN, _BUFFER_OVERRUN = 7, 10
+
 
 class PacketClock:
     """The packets of a stream that is read in chunks, each at the time of its last byte."""
@@ -96,13 +102,6 @@ class PacketClock:
         keep = bisect_left(stops, pieces[-1].stop) if pieces else 0
         del stops[:keep], times_ns[:keep]
         return fd_records(packed)
-
-
-_TIOCGICOUNT = 0x545D
-_COUNTERS = struct.Struct("11i36x")
-"""``struct serial_icounter_struct`` (``linux/serial.h``): cts, dsr, rng, dcd, rx, tx, frame,
-overrun, parity, brk, buf_overrun, and nine reserved."""
-_OVERRUN, _BUFFER_OVERRUN = 7, 10
 
 
 class OverrunWatch:

@@ -59,6 +59,18 @@ _LONGEST = 200  # a CAN FD frame with 64 bytes has 142
 _HIGHEST_STANDARD = 0x7FF
 _NS_PER_MS = 1_000_000
 
+_IN_ORDER = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+BITRATES = {rate: b"S%d" % k for k, rate in enumerate(_IN_ORDER)} | {750_000: b"S7", 83_300: b"S9"}
+"""Bit rate [bit/s] to the command that sets it (S7 is 800,000 with some adapters)."""
+
+_CHUNK = 65536
+_SHORT = 2048  # a terminal gives up to 4095 bytes a read; after fewer there are no more
+_MOST_BYTES = 1 << 20
+_ANSWER_S = 0.2
+_PAUSE_S = 0.002  # a later stamp against more waking: at most this late
+_QUIET_S = 0.05
+_WRITE_S = 1.0
+
 
 class SlcanText:
     """Turns an adapter's bytes into frames; keeps the beginning of an unfinished line."""
@@ -172,19 +184,6 @@ def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
             malformed += 1
     tally.malformed("malformed line", malformed)
     return found
-
-
-_IN_ORDER = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
-BITRATES = {rate: b"S%d" % k for k, rate in enumerate(_IN_ORDER)} | {750_000: b"S7", 83_300: b"S9"}
-"""Bit rate [bit/s] to the command that sets it (S7 is 800,000 with some adapters)."""
-
-_CHUNK = 65536
-_SHORT = 2048  # a terminal gives up to 4095 bytes a read; after fewer there are no more
-_MOST_BYTES = 1 << 20
-_ANSWER_S = 0.2
-_PAUSE_S = 0.002  # a later stamp against more waking: at most this late
-_QUIET_S = 0.05
-_WRITE_S = 1.0
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,15 @@ _ERROR = re.compile(r"< *(error\b[^>]*?) *>")
 _LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
 _HIGHEST_STANDARD = 0x7FF
 
+PORT = 29536
+"""Where socketcand listens unless told otherwise."""
+
+_CONNECT_S = 5.0
+_PIECE = 4096  # bytes that share a time of arrival: those of one segment, mostly fewer
+_MOST_PIECES = 512  # in one read
+_LATEST_NS = 1_000_000_000  # a piece is taken from the kernel within this time
+_LONGEST_ANSWER = 4096
+
 
 class SocketcandText:
     """Turns a server's bytes into frames; keeps the beginning of an unfinished message."""
@@ -156,16 +165,6 @@ def _time_ns(stamp: str, t_host_ns: int, tally: Tally) -> int:
         return t_host_ns
     seconds, fraction = found.groups(default="")
     return int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))
-
-
-PORT = 29536
-"""Where socketcand listens unless told otherwise."""
-
-_CONNECT_S = 5.0
-_PIECE = 4096  # bytes that share a time of arrival: those of one segment, mostly fewer
-_MOST_PIECES = 512  # in one read
-_LATEST_NS = 1_000_000_000  # a piece is taken from the kernel within this time
-_LONGEST_ANSWER = 4096
 
 
 class SocketcandLink:

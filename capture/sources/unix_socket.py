@@ -65,6 +65,8 @@ _SHAPES = {
 }
 """Size of a packet to its number of records and the size of its head."""
 
+_BUFFER_BYTES = 4 << 20
+
 
 @dataclass
 class _Sender:
@@ -363,9 +365,6 @@ def _clear(text: str, path: Path) -> None:
             if error.errno not in (errno.EAGAIN, errno.EPROTOTYPE):
                 raise SourceError(text, f"{path}: {error.strerror}") from error
     raise SourceError(text, f"another program listens at {path}")
-
-
-_BUFFER_BYTES = 4 << 20
 
 
 class FrameSender(Closing):

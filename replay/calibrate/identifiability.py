@@ -64,6 +64,20 @@ _TELLS = {
     DELAY: "another frequency",
 }
 
+PLAY_RAD = 0.02
+"""A play, as a worn gear has it [rad]."""
+
+PLAY_SPREAD_RAD = 0.05
+"""Prior standard deviation of a play [rad]."""
+
+_ITERATIONS = 4  # of a fit under another law; it starts from the fit under the twin's
+
+_LINEAR = 0.8
+"""How far a law's weight, which is of first order, may be from 1: laws that were the robot's came
+out at 0.4 to 1.7, and play in the gears at -4 to -0.5."""
+
+_MOVES = 1e-3  # a joint that moves less shows no play [rad, RMS]
+
 
 @dataclass(frozen=True)
 class CorrelatedParameters:
@@ -129,21 +143,6 @@ def suggested_recordings(
     if by_step:
         by_experiment[_FINER] = [unknowns[i].label for i in by_step]
     return tuple(f"{', '.join(names)}: {what}" for what, names in by_experiment.items())
-
-
-PLAY_RAD = 0.02
-"""A play, as a worn gear has it [rad]."""
-
-PLAY_SPREAD_RAD = 0.05
-"""Prior standard deviation of a play [rad]."""
-
-_ITERATIONS = 4  # of a fit under another law; it starts from the fit under the twin's
-
-_LINEAR = 0.8
-"""How far a law's weight, which is of first order, may be from 1: laws that were the robot's came
-out at 0.4 to 1.7, and play in the gears at -4 to -0.5."""
-
-_MOVES = 1e-3  # a joint that moves less shows no play [rad, RMS]
 
 
 @dataclass(frozen=True)

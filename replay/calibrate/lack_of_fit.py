@@ -43,6 +43,21 @@ from .recorded import Measured
 
 _STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
+HARMONICS = 5
+"""Of the gait that are looked at."""
+
+BETWEEN = 3
+"""Frequencies to each side of a harmonic, one resolution 1/T apart, that give the noise level."""
+
+FEWEST_CYCLES = 3.0
+"""Least number of cycles that separates the lines from the noise between them."""
+
+LAGS = 20
+"""Of the test of Ljung and Box."""
+
+LEVEL = 0.05
+"""Family-wise p below which the twin counts as not fitting."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -72,22 +87,6 @@ def misfit(times_s: FloatArray, measured: FloatArray, twin: FloatArray) -> Misfi
     rate = np.gradient(twin, times_s)
     along, late = np.linalg.lstsq(np.stack([twin, rate - rate.mean()], axis=1), measured)[0]
     return Misfit(rms, float(along - 1.0), float(-late / along))
-
-
-HARMONICS = 5
-"""Of the gait that are looked at."""
-
-BETWEEN = 3
-"""Frequencies to each side of a harmonic, one resolution 1/T apart, that give the noise level."""
-
-FEWEST_CYCLES = 3.0
-"""Least number of cycles that separates the lines from the noise between them."""
-
-LAGS = 20
-"""Of the test of Ljung and Box."""
-
-LEVEL = 0.05
-"""Family-wise p below which the twin counts as not fitting."""
 
 
 @dataclass(frozen=True)

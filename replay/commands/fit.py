@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from ..calibrate.identifiability import Alternative
     from ..calibrate.lack_of_fit import LackOfFit, Misfit
 
+_NOT_NOISE = 3.0
+"""An autocorrelation time of the residual from which it is called out [samples]."""
+
 
 def fit(
     *files: Path,
@@ -123,10 +126,6 @@ def _check(output: Path, scenario: Path | None, spread: float, within: float, *,
         raise UsageError(f"--within {within:g}: give a share between 0 and 1")
     if one:
         raise UsageError("--module and --modules: give one of them")
-
-
-_NOT_NOISE = 3.0
-"""An autocorrelation time of the residual from which it is called out [samples]."""
 
 
 def _summary(calibration: Calibration) -> Iterator[str]:

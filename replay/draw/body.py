@@ -34,6 +34,31 @@ from .motion import Motion
 
 MESHES = "/world/snake/meshes"
 
+_NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+_DRIVEN = np.array([0, 205, 220])
+_IDLE = np.array([112, 112, 120])
+_DRIVES = np.array([255, 84, 48])
+_UNKNOWN = np.array([70, 70, 74, 255], dtype=np.uint8)
+
+MEASURED = "/world/snake/measured"
+COMMANDED = "/world/snake/commanded"
+
+ROUNDING = 2.0**-10
+"""Of positions [m]."""
+TURN_ROUNDING = 2.0**-9
+"""Of quaternions."""
+SHADES = 32
+"""Steps of power from none to full."""
+
+MARKERS = "/world/snake/places"
+LABELS = "/world/snake/place_names"
+
+_LIFT_RADII = 4.0
+_LABEL_COLOR = (255, 255, 255, 255)
+
+MARKS = "/world/snake/named"
+
 
 @dataclass(frozen=True)
 class Look:
@@ -52,9 +77,6 @@ class Look:
     palette: Mapping[str, Color]
     limit_w: float | None
     named: Sequence[str] = ()
-
-
-_NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def meshed(robot: Robot) -> NDArray[np.bool_]:
@@ -112,12 +134,6 @@ def log_poses(
         )
 
 
-_DRIVEN = np.array([0, 205, 220])
-_IDLE = np.array([112, 112, 120])
-_DRIVES = np.array([255, 84, 48])
-_UNKNOWN = np.array([70, 70, 74, 255], dtype=np.uint8)
-
-
 def power_colors(power_w: FloatArray, limit_w: float) -> NDArray[np.uint8]:
     """Return colours of power, symmetric about zero.
 
@@ -135,17 +151,6 @@ def power_colors(power_w: FloatArray, limit_w: float) -> NDArray[np.uint8]:
     colors[..., :3] = np.round(_IDLE + np.abs(share) * (end - _IDLE))
     colors[~known] = _UNKNOWN
     return colors
-
-
-MEASURED = "/world/snake/measured"
-COMMANDED = "/world/snake/commanded"
-
-ROUNDING = 2.0**-10
-"""Of positions [m]."""
-TURN_ROUNDING = 2.0**-9
-"""Of quaternions."""
-SHADES = 32
-"""Steps of power from none to full."""
 
 
 def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -298,13 +303,6 @@ def body_title(content: Content) -> str:
     return f"Body: vermilion drives, cyan is driven, full at ±{value:.3g} {unit} a segment"
 
 
-MARKERS = "/world/snake/places"
-LABELS = "/world/snake/place_names"
-
-_LIFT_RADII = 4.0
-_LABEL_COLOR = (255, 255, 255, 255)
-
-
 def above_joints(
     robot: Robot, names: tuple[str, ...], centre: FloatArray, rotation: FloatArray
 ) -> FloatArray:
@@ -374,9 +372,6 @@ def _known_points(
     point = above_joints(motion.robot, names, *motion.links(rows))
     known = np.isfinite(point).all(axis=-1)
     return point[known], np.count_nonzero(known, axis=1), np.nonzero(known)[1]
-
-
-MARKS = "/world/snake/named"
 
 
 def log_marks(

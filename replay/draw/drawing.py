@@ -45,6 +45,8 @@ FACTS = "/session"
 
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
 
+_WHOLE = Span()
+
 
 def escaped(text: str) -> str:
     """Escape text with names from a log for Markdown.
@@ -169,9 +171,6 @@ def _wave(gait: GaitFacts | GroupFacts, joints: str = "") -> str:
     lags = gait.lag_per_joint_rad.items()
     parts += [f"{math.degrees(lag):.1f}° a joint ({plane})" for plane, lag in lags]
     return ", ".join(parts)
-
-
-_WHOLE = Span()
 
 
 @dataclass

@@ -35,6 +35,23 @@ _DESCRIPTORS = {
     SCALARS: rr.ComponentDescriptor(SCALARS, archetype="rerun.archetypes.Scalars"),
 }
 
+# Vermilion as on the body; violet is on no other map and reads on black and on white.
+_COLORS = {"mechanical": (255, 84, 48, 255), "electrical": (150, 124, 230, 255)}
+
+MODE = "/gait/mode"
+EVENTS = "/events"
+
+INFO = rr.TextLogLevel.INFO
+
+# Levels of rcl_interfaces/msg/Log.
+_LEVELS = {
+    10: rr.TextLogLevel.DEBUG,
+    20: INFO,
+    30: rr.TextLogLevel.WARN,
+    40: rr.TextLogLevel.ERROR,
+    50: rr.TextLogLevel.CRITICAL,
+}
+
 
 def joint_palette(names: Sequence[str]) -> dict[str, Color]:
     """Return the colour of each joint, the same in all views.
@@ -156,10 +173,6 @@ def log_rows(
         rec.send_columns(entity, times, [column.partition(size)])
 
 
-# Vermilion as on the body; violet is on no other map and reads on black and on white.
-_COLORS = {"mechanical": (255, 84, 48, 255), "electrical": (150, 124, 230, 255)}
-
-
 def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     """Write the style of one kind of the body's power.
 
@@ -168,21 +181,6 @@ def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     """
     look = rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5)
     rec.log(f"{TOTAL}/{kind}", look, static=True)
-
-
-MODE = "/gait/mode"
-EVENTS = "/events"
-
-INFO = rr.TextLogLevel.INFO
-
-# Levels of rcl_interfaces/msg/Log.
-_LEVELS = {
-    10: rr.TextLogLevel.DEBUG,
-    20: INFO,
-    30: rr.TextLogLevel.WARN,
-    40: rr.TextLogLevel.ERROR,
-    50: rr.TextLogLevel.CRITICAL,
-}
 
 
 def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:

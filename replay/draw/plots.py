@@ -65,6 +65,8 @@ _SHOWN_ELSEWHERE = {"/gait/mode", "/rosout", "/robot_description"}
 _TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}  # types whose messages are each about something else
 _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 
+_ANGLES = (COMMANDED, MEASURED, ERROR)
+
 
 def is_foreign(session: SessionView) -> bool:
     """Return whether a session was neither recorded nor imported by undulog.
@@ -178,8 +180,6 @@ def _tables(session: SessionView, topic: str) -> Iterator[Any]:
         if len(table):
             yield table
 
-
-_ANGLES = (COMMANDED, MEASURED, ERROR)
 
 Rows = Callable[[str, IntArray], slice]
 """Of an entity and the times of its samples: which of them are drawn."""

@@ -30,6 +30,21 @@ RANGES = "/world/snake/ranges"
 _AT_ONCE = 4  # sensors that are read in one pass over the file: an hour of each takes memory
 _RANGE_COLOR = (232, 214, 130, 255)
 
+TRAIL = "/world/trail"
+TRAIL_RATE_HZ = 10.0
+TRAIL_SECONDS = 20.0
+
+_COLOR = (104, 108, 128, 255)
+_WHOLE = Span()
+
+CYLINDERS = "/world/obstacles/cylinders"
+BOXES = "/world/obstacles/boxes"
+TARGET = "/world/target"
+
+_STONE = (120, 126, 134, 255)
+_GOAL = (92, 200, 120, 255)
+_RIM_SIDES = 64
+
 
 def rays(
     robot: Robot,
@@ -131,14 +146,6 @@ def log_rays(
         rec.send_columns(RANGES, times, columns)
 
 
-TRAIL = "/world/trail"
-TRAIL_RATE_HZ = 10.0
-TRAIL_SECONDS = 20.0
-
-_COLOR = (104, 108, 128, 255)
-_WHOLE = Span()
-
-
 def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDArray[np.float32]]:
     """Return line segments between successive head positions.
 
@@ -177,15 +184,6 @@ def log_trail(
     rec.log(TRAIL, look, static=True)
     for part, times in clock.rows(t_ns):
         rec.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces[part]))
-
-
-CYLINDERS = "/world/obstacles/cylinders"
-BOXES = "/world/obstacles/boxes"
-TARGET = "/world/target"
-
-_STONE = (120, 126, 134, 255)
-_GOAL = (92, 200, 120, 255)
-_RIM_SIDES = 64
 
 
 def world_of(session: SessionView, warnings: list[str]) -> World | None:

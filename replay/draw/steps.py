@@ -54,6 +54,15 @@ arrow: Any = cast("Any", pa)  # without types
 
 CYCLES = "/cycles"
 
+SEGMENTS = "/segments"
+CURRENT: Color = (235, 235, 240, 255)
+
+# Side by side, since Rerun adds the light of bars that lie on each other; the whisker is thin.
+_LEFT, _WIDTH = -0.42, 0.54
+_WHISKER = 0.14
+_CURRENT_LEFT, _CURRENT_WIDTH = 0.16, 0.26
+_MARK_LEFT, _MARK_WIDTH = -0.56, 0.12
+
 
 def cycle_tables(analysis: Analysis, steady: CycleMaps | None = None) -> tuple[CycleTable, ...]:
     """Return an analysis's values by joint and cycle.
@@ -202,16 +211,6 @@ def _energy(analysis: Analysis) -> list[CycleTable]:
     value = np.where(covered >= LEAST_COVERED, value, np.nan)
     names, start_s = tuple(joint.name for joint in known), np.array(energy.start_s)
     return [CycleTable(ENERGY, names, start_s, np.array(energy.stop_s), value)]
-
-
-SEGMENTS = "/segments"
-CURRENT: Color = (235, 235, 240, 255)
-
-# Side by side, since Rerun adds the light of bars that lie on each other; the whisker is thin.
-_LEFT, _WIDTH = -0.42, 0.54
-_WHISKER = 0.14
-_CURRENT_LEFT, _CURRENT_WIDTH = 0.16, 0.26
-_MARK_LEFT, _MARK_WIDTH = -0.56, 0.12
 
 
 def charts(analysis: Analysis) -> tuple[Chart, ...]:

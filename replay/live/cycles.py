@@ -46,6 +46,8 @@ _KEYS = (
 )
 _COMMAND, _POSITION, _VELOCITY, _EFFORT = _KEYS
 
+_WIDTH = 0.8
+
 
 @dataclass(frozen=True)
 class Cycle:
@@ -267,9 +269,6 @@ class CycleMeter:
 def _whole(phase: FloatArray) -> FloatArray:
     """The phase counted upwards, whichever way the gait runs."""
     return phase if phase[-1] >= phase[0] else -phase
-
-
-_WIDTH = 0.8
 
 
 class CycleBars:

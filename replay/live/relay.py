@@ -45,6 +45,17 @@ from .scene import LiveScene
 
 _INBOX_LOOK_S = 0.005
 
+BATCH_S = 0.025
+"""How often what has come is drawn [s]."""
+SILENCE_S = 10.0
+"""A feed that is silent for so long has ended; a live one repeats its definitions [s]."""
+
+_REST_S = 0.01  # between two drawings, for the thread that reads
+_LAGS_KEPT = 100_000
+_FLUSH_S = 1.0
+_GRACE_S = 3.0
+_LOOK_S = 0.05
+
 
 class Datagram(NamedTuple):
     """One datagram, its head read.
@@ -169,17 +180,6 @@ def _answers(path: Path) -> bool:
             return False
     return True
 
-
-BATCH_S = 0.025
-"""How often what has come is drawn [s]."""
-SILENCE_S = 10.0
-"""A feed that is silent for so long has ended; a live one repeats its definitions [s]."""
-
-_REST_S = 0.01  # between two drawings, for the thread that reads
-_LAGS_KEPT = 100_000
-_FLUSH_S = 1.0
-_GRACE_S = 3.0
-_LOOK_S = 0.05
 
 Connect = Callable[[BoundedStream], None]
 """Gives a recording stream its sink."""

@@ -62,6 +62,20 @@ _NAME_RATE_HZ = 25.0
 _LIFT_RADII, _LIFT, _TIER = 5.0, 0.05, 0.08
 _MESH_OPACITY = 90
 
+LINES = f"{COMPARED}/places"
+POWER = f"{TOTAL}/mechanical"
+
+_DASH_S, _SPACE_S = (0.1, 0.04, 0.2), 0.06
+_WIDTH = 2.0
+
+BARS = f"{COMPARED}/segments"
+DIFFERENCES = "/segments"
+
+_WIDE, _NARROW = 0.5, 0.26
+_ALL = _WIDE + _NARROW
+_WHISKER = 0.25  # of the bar's width
+_SEEN = 0.02  # a whisker is drawn if it ends further from its bar's end than this share of the bar
+
 
 def tint(place: int) -> Color:
     """Return the colour of a session as a whole.
@@ -153,13 +167,6 @@ def _end(one: Side, timeline: str) -> int | None:
     return None if rhythm is None else round(float(rhythm.cycles.max()) * 1e9)
 
 
-LINES = f"{COMPARED}/places"
-POWER = f"{TOTAL}/mechanical"
-
-_DASH_S, _SPACE_S = (0.1, 0.04, 0.2), 0.06
-_WIDTH = 2.0
-
-
 def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
     """Replace the spaces of a dashed line by NaN; each session has dashes of its own length.
 
@@ -219,15 +226,6 @@ def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None
         own: dict[str, Any] = {"colors": tint(place), "widths": 1.0} if place else {}
         look = rr.SeriesLines.from_fields(names=side.name, **own)
         rec.log(f"{side.entity}{POWER}", look, static=True)
-
-
-BARS = f"{COMPARED}/segments"
-DIFFERENCES = "/segments"
-
-_WIDE, _NARROW = 0.5, 0.26
-_ALL = _WIDE + _NARROW
-_WHISKER = 0.25  # of the bar's width
-_SEEN = 0.02  # a whisker is drawn if it ends further from its bar's end than this share of the bar
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,11 @@ _ALIGNED = {
     Align.PHASE: "Aligned by the phase of the gait.",
 }
 
+SEPARATE = "/head_distance"
+"""Distance of the heads, below a session's own path."""
+
+_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)  # what is drawn of the first body only
+
 
 @dataclass(frozen=True)
 class Found:
@@ -121,12 +126,6 @@ def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     if len(changed) > _CHANGES:
         lines.append(f"- and {len(changed) - _CHANGES} more, which `undulog compare` lists")
     return "\n".join(lines)
-
-
-SEPARATE = "/head_distance"
-"""Distance of the heads, below a session's own path."""
-
-_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)  # what is drawn of the first body only
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,14 @@ COMPARED = "/compared"
 
 _TOPICS = ("/joint_states", "/gait")
 
+_LOOK_AT = 1000  # samples of the head among which a first moment is looked for
+
+_ROTATION = 0.99  # a quaternion shorter than this is none
+
+_INSTANTS = 48  # of a cycle, at which a body's direction is taken
+
+_SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
+
 
 @dataclass(frozen=True)
 class Side:
@@ -277,15 +285,6 @@ def _aligned(side: Side, how: Align) -> Side:
         return side
     zero_ns = int(rhythm.t_ns[0]) if how is Align.GAIT else side.start_ns
     return replace(side, zero_ns=zero_ns, cycles=-int(np.floor(rhythm.cycles[0])))
-
-
-_LOOK_AT = 1000  # samples of the head among which a first moment is looked for
-
-_ROTATION = 0.99  # a quaternion shorter than this is none
-
-_INSTANTS = 48  # of a cycle, at which a body's direction is taken
-
-_SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
 
 
 @dataclass(frozen=True)

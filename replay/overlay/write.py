@@ -61,6 +61,11 @@ _AHEAD = 32  # chunks that may wait to be written
 
 _PROPERTIES = "/__properties/**"
 
+ANGLES = "/angles"
+"""Differences of the measured angles, below a session's own path."""
+
+_APART_RATE_HZ = 25.0
+
 
 def chunks_of(
     recording: Path, entity: str, *, later_ns: int = 0, more_cycles: int = 0
@@ -114,12 +119,6 @@ def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
             batch = batch.set_column(place, field, _ARROW.array(later, field.type))
     (moved,) = _CHUNK.from_record_batch(batch)
     return moved
-
-
-ANGLES = "/angles"
-"""Differences of the measured angles, below a session's own path."""
-
-_APART_RATE_HZ = 25.0
 
 
 class Place(StrEnum):

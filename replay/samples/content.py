@@ -21,6 +21,27 @@ Color = tuple[int, int, int, int]
 GREY: Color = (140, 140, 140, 255)
 """Grey of everything commanded, a null or a reference."""
 
+NAMED = (255, 95, 190, 255)
+"""Pink of a module that a test names: on none of the maps."""
+
+MAPS = "/maps"
+
+MECHANICAL = "/power/mechanical"
+TOTAL = "/power/total"
+
+_SHORT = {
+    "/joint_current": "Current",
+    "/joint_voltage": "Voltage",
+    "/joint_temperature": "Temperature",
+    "/joint_velocity": "Velocity",
+    "/energy_ledger": "Ledger",
+    "/joint_power/mechanical": "Mechanical power",
+    "/joint_power/mechanical_plus": "Mechanical power, positive part",
+    "/joint_power/electrical": "Electrical power",
+    "/joint_power/electrical_plus": "Electrical power, positive part",
+}
+_UNITS = {"degC": "°C"}
+
 
 @dataclass(frozen=True)
 class Series:
@@ -100,13 +121,6 @@ class CycleTable:
     value: FloatArray
 
 
-NAMED = (255, 95, 190, 255)
-"""Pink of a module that a test names: on none of the maps."""
-
-
-MAPS = "/maps"
-
-
 @dataclass(frozen=True)
 class HeatMap:
     """One map.
@@ -145,10 +159,6 @@ class HeatMap:
 
         digits = decimals_for_values([self.low, self.high], 3)
         return number(self.low, digits), number(self.high, digits)
-
-
-MECHANICAL = "/power/mechanical"
-TOTAL = "/power/total"
 
 
 @dataclass(frozen=True)
@@ -242,20 +252,6 @@ class Layer:
 
 Tab = Literal["session", "cycles", "mean-cycle"]
 """The tabs of the layout."""
-
-
-_SHORT = {
-    "/joint_current": "Current",
-    "/joint_voltage": "Voltage",
-    "/joint_temperature": "Temperature",
-    "/joint_velocity": "Velocity",
-    "/energy_ledger": "Ledger",
-    "/joint_power/mechanical": "Mechanical power",
-    "/joint_power/mechanical_plus": "Mechanical power, positive part",
-    "/joint_power/electrical": "Electrical power",
-    "/joint_power/electrical_plus": "Electrical power, positive part",
-}
-_UNITS = {"degC": "°C"}
 
 
 def signal_title(topic: str, unit: str) -> str:

@@ -37,6 +37,20 @@ from .tracks import (
     wanted_fields,
 )
 
+DRAWN = {"/joint_states", "/joint_commands", "/gait"}
+"""JointState topics that have views of their own."""
+
+SIGNALS = "/signals"
+
+GAIT = "/gait"
+
+_KEPT = 4000  # samples of each line that are kept, about
+_LEAST_CONTEXT_NS, _MOST_CONTEXT_NS = 500_000_000, 60_000_000_000
+_REACH_STEPS = 1.2 * GAP_STEPS
+
+_LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
+_LOOK_NS = 2_000_000_000  # how long is looked into each of them [ns]
+
 
 def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:
     """Return measured minus commanded angles, at the measurement's times.
@@ -144,12 +158,6 @@ def segment_power(joint_power_w: FloatArray) -> FloatArray:
     return shares
 
 
-DRAWN = {"/joint_states", "/joint_commands", "/gait"}
-"""JointState topics that have views of their own."""
-
-SIGNALS = "/signals"
-
-
 def topic_entity(root: str, topic: str) -> str:
     """Return the entity of a topic.
 
@@ -192,16 +200,6 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
         if topic not in DRAWN and field == "position"
     }
     return {entity: tracks for entity, tracks in found.items() if tracks}
-
-
-GAIT = "/gait"
-
-_KEPT = 4000  # samples of each line that are kept, about
-_LEAST_CONTEXT_NS, _MOST_CONTEXT_NS = 500_000_000, 60_000_000_000
-_REACH_STEPS = 1.2 * GAP_STEPS
-
-_LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
-_LOOK_NS = 2_000_000_000  # how long is looked into each of them [ns]
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,13 @@ _READ_AGAIN = 8  # how many stretches a chunk may be read for, in the mean, wher
 
 _FIRST_NS, _LAST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
+SESSION_TIME = "session_time"
+GAIT_CYCLE = "gait_cycle"
+ENSEMBLE_CYCLE = "ensemble_cycle"
+
+ROWS_PER_CHUNK = 4096
+"""Rows sent at once: small enough to page through an hour, large enough to be columns."""
+
 
 @dataclass(frozen=True)
 class Span:
@@ -121,14 +128,6 @@ def _laborious(session: SessionView, length_ns: int) -> bool:
     length = np.uint64(length_ns)
     read = int((last_ns // length - np.minimum(first_ns, last_ns) // length).sum()) + len(last_ns)
     return count > 1 and read > _LEAST_STRETCHES + _READ_AGAIN * len(last_ns)
-
-
-SESSION_TIME = "session_time"
-GAIT_CYCLE = "gait_cycle"
-ENSEMBLE_CYCLE = "ensemble_cycle"
-
-ROWS_PER_CHUNK = 4096
-"""Rows sent at once: small enough to page through an hour, large enough to be columns."""
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,18 @@ Columns = dict[tuple[str, str], tuple["Track", ...]]
 
 Resampler = Callable[[IntArray, FloatArray, IntArray], FloatArray]
 
+MOST_JOINTS = 1000
+"""Of a topic that is drawn."""
+MOST_TOPICS = 100
+"""JointState topics that are drawn."""
+
+LEVELS = 500
+"""Steps that the range of a plotted line is cut into, at least."""
+_TAIL = 0.01
+
+GAP_STEPS = 5.0
+"""Two samples further apart than this many typical steps have a gap between them."""
+
 
 @dataclass(frozen=True)
 class Track:
@@ -62,12 +74,6 @@ class Table:
     names: tuple[str, ...]
     t_ns: IntArray
     values: FloatArray
-
-
-MOST_JOINTS = 1000
-"""Of a topic that is drawn."""
-MOST_TOPICS = 100
-"""JointState topics that are drawn."""
 
 
 def drawn_topics(session: SessionView) -> tuple[list[str], int]:
@@ -248,11 +254,6 @@ def resampled(
     return found
 
 
-LEVELS = 500
-"""Steps that the range of a plotted line is cut into, at least."""
-_TAIL = 0.01
-
-
 def plot_step(values: FloatArray) -> float:
     """Return the step that a plotted line is rounded to.
 
@@ -289,10 +290,6 @@ def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArr
     found = values.copy()
     found[:, some] = np.round(values[:, some] / step[some]) * step[some]
     return found
-
-
-GAP_STEPS = 5.0
-"""Two samples further apart than this many typical steps have a gap between them."""
 
 
 def typical_step_ns(t_ns: IntArray) -> int:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from ..scenario.scenario import Scenario
     from ..twin.recording import Recording
 
+_TWIN = "twin"
+_CONTRACT = CommandTopic()
+
 
 @dataclass(frozen=True)
 class BusDrive:
@@ -145,10 +148,6 @@ def _only_recorder() -> Path | None:
             f"{len(sockets)} recorders run; which one is to receive the gait?\n{listed}"
         )
     return sockets[0] if sockets else None
-
-
-_TWIN = "twin"
-_CONTRACT = CommandTopic()
 
 
 def _dry_runs(

@@ -32,6 +32,40 @@ if TYPE_CHECKING:
     from ..twin.recording import Recording
     from ..twin.twin import Sample
 
+_COLUMNS = (Column("key", left=True), Column("value", left=True), Column("unit", left=True))
+_HEAD = ("name", "description", "robot")
+
+_UNITS = (
+    ("s", "*_s"),
+    ("Hz", "*_hz"),
+    ("V", "*_v"),
+    ("rad", "gait.*amplitude gait.*lag gait.*offset gait.*phase gait.*kick_size noise.position"),
+    ("rad", "*.heading *.slope *.slope_heading *.inclination *.north sensing.servo.* *.backlash"),
+    ("rad", "controller.*.f0 controller.*.largest"),
+    ("rad/s", "gait.*.detuning noise.velocity *.stribeck_speed"),
+    ("1/s", "gait.*.forward gait.*.backward gait.*.approach_rate gait.*.attraction"),
+    ("1/s", "gait.*.feedback"),
+    ("1/m", "controller.*.k"),
+    ("1/rad", "*.proportional_gain"),
+    ("N", "disturbances.force"),
+    ("N m", "noise.effort *.stall_torque *.coulomb_friction *.static_friction"),
+    ("N m/A", "*.torque_constant"),
+    ("N m/rad", "*.gear_stiffness"),
+    ("N m s/rad", "*.viscous_friction *.gear_damping"),
+    ("kg m^2", "*.rotor_inertia"),
+    ("N/m", "world.*.stiffness"),
+    ("N s/m", "world.*.damping world.*.drag_tangential world.*.drag_normal"),
+    ("m/s", "world.velocity world.*.slip_speed"),
+    ("m/s^2", "world.gravity sensing.accelerometer.noise sensing.accelerometer.resolution"),
+    ("T", "sensing.compass.noise sensing.compass.resolution sensing.compass.horizontal_field"),
+    ("m", "sensing.sonar.noise sensing.sonar.resolution sensing.ir.peak *_m"),
+    ("m", "*.position *.radius *.height *.size *.from *.to *.thickness *.centre *.clear *.gap"),
+)
+_NUMBERS = (  # without a unit
+    "*seed *.count *.rays *_bits *.mu *.mu_tangential *.mu_normal *.gain *_gain *.slip_ratio "
+    "*.smallest *.mass_factor *.feedback_bias faults.value"
+)
+
 
 def null(
     scenario: str,
@@ -297,10 +331,6 @@ def _touched(contact_s: dict[str, float]) -> str:
     )
 
 
-_COLUMNS = (Column("key", left=True), Column("value", left=True), Column("unit", left=True))
-_HEAD = ("name", "description", "robot")
-
-
 def show(scenario: str, /, *, json: bool = False) -> None:
     """Show a scenario: robot, gait, world and sensors, every value with its unit, defaults too.
 
@@ -347,38 +377,6 @@ def show(scenario: str, /, *, json: bool = False) -> None:
 def _is_number(value: Any) -> bool:
     every = cast("list[object]", value) if isinstance(value, list) else [value]
     return all(isinstance(one, int | float) and not isinstance(one, bool) for one in every)
-
-
-_UNITS = (
-    ("s", "*_s"),
-    ("Hz", "*_hz"),
-    ("V", "*_v"),
-    ("rad", "gait.*amplitude gait.*lag gait.*offset gait.*phase gait.*kick_size noise.position"),
-    ("rad", "*.heading *.slope *.slope_heading *.inclination *.north sensing.servo.* *.backlash"),
-    ("rad", "controller.*.f0 controller.*.largest"),
-    ("rad/s", "gait.*.detuning noise.velocity *.stribeck_speed"),
-    ("1/s", "gait.*.forward gait.*.backward gait.*.approach_rate gait.*.attraction"),
-    ("1/s", "gait.*.feedback"),
-    ("1/m", "controller.*.k"),
-    ("1/rad", "*.proportional_gain"),
-    ("N", "disturbances.force"),
-    ("N m", "noise.effort *.stall_torque *.coulomb_friction *.static_friction"),
-    ("N m/A", "*.torque_constant"),
-    ("N m/rad", "*.gear_stiffness"),
-    ("N m s/rad", "*.viscous_friction *.gear_damping"),
-    ("kg m^2", "*.rotor_inertia"),
-    ("N/m", "world.*.stiffness"),
-    ("N s/m", "world.*.damping world.*.drag_tangential world.*.drag_normal"),
-    ("m/s", "world.velocity world.*.slip_speed"),
-    ("m/s^2", "world.gravity sensing.accelerometer.noise sensing.accelerometer.resolution"),
-    ("T", "sensing.compass.noise sensing.compass.resolution sensing.compass.horizontal_field"),
-    ("m", "sensing.sonar.noise sensing.sonar.resolution sensing.ir.peak *_m"),
-    ("m", "*.position *.radius *.height *.size *.from *.to *.thickness *.centre *.clear *.gap"),
-)
-_NUMBERS = (  # without a unit
-    "*seed *.count *.rays *_bits *.mu *.mu_tangential *.mu_normal *.gain *_gain *.slip_ratio "
-    "*.smallest *.mass_factor *.feedback_bias faults.value"
-)
 
 
 def unit_of(key: str) -> str | None:

@@ -48,6 +48,19 @@ lag = 0.0
 _FASTEST_HZ = 16_000  # physics; an hour there takes hours
 _NO_LIMIT = {"min_voltage": -math.inf}
 
+_NOTHING = "-"
+_TOO_NARROW = "; the terminal is too narrow for all of it, --json has it"
+
+_NAMED = 3
+_REMARKS = 6
+_SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
+    "range": ("°", math.degrees(1.0)),
+    "rate": ("°/s", math.degrees(1.0)),
+    "tracking error": ("°", math.degrees(1.0)),
+    "current": ("A", 1.0),
+    "torque": ("N m", 1.0),
+}
+
 
 class Verdict(StrEnum):
     """Verdict of a dry run."""
@@ -242,10 +255,6 @@ def _approach_s(first: FloatArray, limits: GateLimits) -> float:
     return Ramp(rest, np.clip(first, limits.lower, limits.upper), limits.ramp_rate).duration_s
 
 
-_NOTHING = "-"
-_TOO_NARROW = "; the terminal is too narrow for all of it, --json has it"
-
-
 def _number(value: float, form: str) -> str:
     return _NOTHING if math.isnan(value) else format(value, f"z{form}")
 
@@ -301,17 +310,6 @@ def joint_table(joints: Sequence[JointDemand], width: int) -> Iterator[str]:
         f"stall torque{_TOO_NARROW if left_out else ''}"
     )
     yield from (line.plain for line in lines)
-
-
-_NAMED = 3
-_REMARKS = 6
-_SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
-    "range": ("°", math.degrees(1.0)),
-    "rate": ("°/s", math.degrees(1.0)),
-    "tracking error": ("°", math.degrees(1.0)),
-    "current": ("A", 1.0),
-    "torque": ("N m", 1.0),
-}
 
 
 def summary_lines(run: DryRun, width: int) -> Iterator[str]:

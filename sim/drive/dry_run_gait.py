@@ -28,6 +28,8 @@ _ENERGIES = tuple(
     JOINT_TERMS.index(term) for term in ("mechanical_net", "mechanical_abs", "electrical_net")
 )
 
+_CHANGED = 1e-12  # rad; the same as the clamp's
+
 
 @dataclass(frozen=True)
 class Demand:
@@ -221,9 +223,6 @@ class DemandTally:
             )
             for i, joint in enumerate(robot.joints)
         )
-
-
-_CHANGED = 1e-12  # rad; the same as the clamp's
 
 
 class NotedGait:

@@ -61,6 +61,23 @@ from .outcome import FaultKind, GateFault, JointStatus
 
 _IDENTIFIERS_SHOWN = 6
 
+_INTERVALS = 3
+_LEAST_TICKS = 3
+_LEAST_GAPS = 4
+
+_LESS = 0.8
+_MORE = 0.02
+
+_SHOWN = 4
+
+# Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus.
+_MOST_ROUNDS = 2
+_FIRST_PATIENCE = 8  # ticks, before the reply interval is known
+_MOST_PATIENCE = 50
+# Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
+# with one, a request before a reply is sent only after a time without.
+_LAGGING = {1: 2, 2: 16}
+
 
 class BusCheck:
     """Counts received frames by identifier and detects foreign ones.
@@ -138,11 +155,6 @@ def _sorted(identifiers: set[int]) -> IntArray:
     return np.array(sorted(identifiers), dtype=np.int64)
 
 
-_INTERVALS = 3
-_LEAST_TICKS = 3
-_LEAST_GAPS = 4
-
-
 class Silence:
     """Counts control ticks in which no joint of a bus was received.
 
@@ -202,10 +214,6 @@ class Silence:
         return True
 
 
-_LESS = 0.8
-_MORE = 0.02
-
-
 class CurrentLimiter:
     """Keeps currents below their limits, as far as a position servo can be kept there.
 
@@ -245,9 +253,6 @@ class CurrentLimiter:
         pulled = np.where(pulls, angle, 0.0)
         pulled += self._share * (wanted - pulled)
         return np.where(pulls, pulled, wanted)
-
-
-_SHOWN = 4
 
 
 class Watch:
@@ -326,15 +331,6 @@ def _named(names: tuple[str, ...], chosen: BoolArray) -> str:
         return "the robot is"
     found = list(compress(names, chosen))
     return some_names(found, _SHOWN) + (" is" if len(found) == 1 else " are")
-
-
-# Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus.
-_MOST_ROUNDS = 2
-_FIRST_PATIENCE = 8  # ticks, before the reply interval is known
-_MOST_PATIENCE = 50
-# Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
-# with one, a request before a reply is sent only after a time without.
-_LAGGING = {1: 2, 2: 16}
 
 
 @dataclass

@@ -43,6 +43,15 @@ _OF_QUANTITY = {
     "min_voltage": "voltage",
 }
 
+_ROUNDING = 1e-12  # rad; a command that is off a limit in its last bits was not cut
+
+_PEAK = 1.5  # greatest slope of 3 x^2 - 2 x^3
+
+HOLD_S = 0.2
+"""So long the last pose is commanded again before nothing is sent any more [s]."""
+
+_SHOWN = 8
+
 
 def missing_limits(robot: Robot) -> tuple[str, ...]:
     """The limits that a robot lacks to be driven over its bus.
@@ -223,9 +232,6 @@ class Spacing:
         self._last, self._sent_ns = command, sent_ns
 
 
-_ROUNDING = 1e-12  # rad; a command that is off a limit in its last bits was not cut
-
-
 class Clamped(NamedTuple):
     """A command that may be sent.
 
@@ -305,9 +311,6 @@ class Clamp:
         return found
 
 
-_PEAK = 1.5  # greatest slope of 3 x^2 - 2 x^3
-
-
 class Ramp:
     """A straight way between two poses, with no rate at either end.
 
@@ -338,10 +341,6 @@ class Ramp:
         if time_s >= self.duration_s:
             return self._start + self._way
         return self._start + smoothstep(time_s / self.duration_s) * self._way
-
-
-HOLD_S = 0.2
-"""So long the last pose is commanded again before nothing is sent any more [s]."""
 
 
 class Ending:
@@ -381,9 +380,6 @@ class Ending:
             Joint angles [rad], shape (m,).
         """
         return self._ramp.at(time_s)
-
-
-_SHOWN = 8
 
 
 def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str | None:

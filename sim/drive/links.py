@@ -57,6 +57,11 @@ _OF_JOINTS = (
 _VECTORS = (Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
 _GAIT_QUANTITIES = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
+_TICK = re.compile(rb"< tick (\d{1,18}) >")
+_IDENTITY = re.compile(r"undulog virtual-robot (\S+) (paced|lockstep)")
+_CHUNK = 1 << 18
+_SEND_S = 1.0
+
 
 class BusReadings:
     """Collects decoded frames; call :meth:`readings` once a control tick.
@@ -182,12 +187,6 @@ def _with_gait_signals(robot: Robot) -> Robot:
         return robot
     signals = tuple(signal for signal in robot.bus.signals if signal.quantity in _GAIT_QUANTITIES)
     return dataclasses.replace(robot, bus=dataclasses.replace(robot.bus, signals=signals))
-
-
-_TICK = re.compile(rb"< tick (\d{1,18}) >")
-_IDENTITY = re.compile(r"undulog virtual-robot (\S+) (paced|lockstep)")
-_CHUNK = 1 << 18
-_SEND_S = 1.0
 
 
 class Link(Protocol):

@@ -28,6 +28,15 @@ from .outcome import FaultKind, GateFault, GateInput, GateStep, Phase
 
 _STREAMS = (0, 1, 2)
 
+LOST_S = 5.0
+"""A robot in lockstep that doesn't come to its next tick within this time is lost [s]."""
+
+_WORDS = {
+    signal.SIGINT: "stop requested (Ctrl-C)",
+    signal.SIGTERM: "stop requested (SIGTERM)",
+    signal.SIGHUP: "the console is gone",
+}
+
 
 class ConsoleWatch:
     """Detects that a terminal hung up."""
@@ -50,10 +59,6 @@ class ConsoleWatch:
         os.close(nowhere)
         self._terminals = []
         return True
-
-
-LOST_S = 5.0
-"""A robot in lockstep that doesn't come to its next tick within this time is lost [s]."""
 
 
 class WallPace:
@@ -131,13 +136,6 @@ class LockstepPace:
         if self._first is None:
             self._first = tick
         return tick - self._first, frames
-
-
-_WORDS = {
-    signal.SIGINT: "stop requested (Ctrl-C)",
-    signal.SIGTERM: "stop requested (SIGTERM)",
-    signal.SIGHUP: "the console is gone",
-}
 
 
 def stop_reason(stop: StopRequest, *, console_gone: bool) -> str:

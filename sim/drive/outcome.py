@@ -12,6 +12,8 @@ from undulog.capture.common.arrays import FloatArray
 
 from ..gait.contract import GaitTick, Readings
 
+_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+
 
 class FaultKind(StrEnum):
     """Kind of a fault."""
@@ -61,9 +63,6 @@ class GateFault:
             "value": self.value,
             "limit": self.limit,
         }
-
-
-_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 @dataclass(frozen=True)

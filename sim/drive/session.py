@@ -40,6 +40,13 @@ _AT_ONCE = 64
 _WAIT_S = 0.02
 _LAST_S = 5.0
 
+_EVENTS_OF = "drive"
+_DECODE_TICKS = 10  # many frames at once cost little more than a few
+# So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute.
+_ROOM = 48 << 20
+# So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints.
+_LAST_WORDS = 4 << 20
+
 
 class GaitPublisher:
     """One connection to a recorder's control socket.
@@ -117,14 +124,6 @@ class GaitPublisher:
                     self.taken += sum(request["do"] == "gait" for request in batch)
             if last:
                 return
-
-
-_EVENTS_OF = "drive"
-_DECODE_TICKS = 10  # many frames at once cost little more than a few
-# So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute.
-_ROOM = 48 << 20
-# So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints.
-_LAST_WORDS = 4 << 20
 
 
 class BusSession:

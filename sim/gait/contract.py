@@ -22,6 +22,12 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.robot.model import Robot
 
+CONTROL_RATE_HZ = 100
+"""Rate of control and log."""
+
+WALK = "walk"
+"""The mode of a gait that only goes on."""
+
 
 @dataclass(frozen=True)
 class Readings:
@@ -47,13 +53,6 @@ class Readings:
         """Return readings without values."""
         unknown = frozen(np.full(len(robot.joints), np.nan))
         return cls(unknown, unknown)
-
-
-CONTROL_RATE_HZ = 100
-"""Rate of control and log."""
-
-WALK = "walk"
-"""The mode of a gait that only goes on."""
 
 
 class GaitTick(NamedTuple):

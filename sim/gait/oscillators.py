@@ -53,6 +53,10 @@ STEP_OF_FASTEST = 0.2
 """Longest step, as a share of the shortest time constant that the rates' bound allows: a step of
 the classical Runge-Kutta method then errs by (0.2)^5/120 = 3e-6 of a deviation at most."""
 
+_STRONGEST = float(CONTROL_RATE_HZ)  # greatest coupling, feedback and rate of an oscillator [1/s]
+
+_SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
+
 
 @dataclass(frozen=True)
 class Coupling:
@@ -259,15 +263,10 @@ class Approach:
         self._target = target
 
 
-_STRONGEST = float(CONTROL_RATE_HZ)  # greatest coupling, feedback and rate of an oscillator [1/s]
-
 Numbers: TypeAlias = float | tuple[float, ...]
 """One number for all, or one for each."""
 Rates: TypeAlias = Annotated[Numbers, at_least(-_STRONGEST), at_most(_STRONGEST)]
 PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
-
-
-_SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
 class OscillatorKind(StrEnum):

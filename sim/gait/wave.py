@@ -18,6 +18,15 @@ from undulog.capture.robot.model import Plane, Robot
 
 from .contract import CONTROL_RATE_HZ, WALK, GaitTick, Modulation, Readings
 
+VALUE_NAMES = ("A", "omega", "lag", "offset", "phase")
+"""What is logged of a plane: amplitude [rad], omega [rad/s], signed lag [rad], offset [rad] and
+phase [rad], the last two and the amplitude those of the plane's first joint. Where all joints of
+the plane are alike, the command of its joint i (from 1) is A sin(phase + (i - 1) lag) + offset."""
+
+JOINT_VALUE_NAMES = ("A", "offset", "phase")
+"""What is logged of every driven joint, as ``joint03.A``, where a gait may set joints apart: the
+joint's command is A sin(phase) + offset."""
+
 
 def smoothstep(x: float) -> float:
     """Rise from 0 to 1 with no slope at either end, 3 x^2 - 2 x^3.
@@ -170,16 +179,6 @@ class PlaneGait:
         With +(i-1) phi the crest moves towards the low indices, so towards the head.
         """
         return -self.lag if self.wave is Wave.HEAD_TO_TAIL else self.lag
-
-
-VALUE_NAMES = ("A", "omega", "lag", "offset", "phase")
-"""What is logged of a plane: amplitude [rad], omega [rad/s], signed lag [rad], offset [rad] and
-phase [rad], the last two and the amplitude those of the plane's first joint. Where all joints of
-the plane are alike, the command of its joint i (from 1) is A sin(phase + (i - 1) lag) + offset."""
-
-JOINT_VALUE_NAMES = ("A", "offset", "phase")
-"""What is logged of every driven joint, as ``joint03.A``, where a gait may set joints apart: the
-joint's command is A sin(phase) + offset."""
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,10 @@ from .engine import BodyStart, BodyState
 MAX_JOINTS = 127
 """Links beside the base that the engine can hold."""
 
+_AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
+_NO_SHAPE = -1
+_UNTURNED = (0.0, 0.0, 0.0, 1.0)
+
 
 @contextlib.contextmanager
 def _quiet_stderr() -> Generator[None]:
@@ -50,9 +54,6 @@ def _quiet_stderr() -> Generator[None]:
 with _quiet_stderr():
     import pybullet
 
-_AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
-_NO_SHAPE = -1
-_UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 # Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
 _pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity

@@ -24,6 +24,8 @@ from .engine import BodyState
 
 _NEXT, _LAST = frozen(np.array([1, 2, 0])), frozen(np.array([2, 0, 1]))
 
+_TINY = 1e-300  # makes 0/0 a zero
+
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products; ``numpy.cross`` costs six times as much on short arrays.
@@ -66,9 +68,6 @@ def out_of_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     u, w = quaternion[:3], quaternion[3]
     turned = cross(u, vector)
     return vector + 2.0 * w * turned + 2.0 * cross(u, turned)
-
-
-_TINY = 1e-300  # makes 0/0 a zero
 
 
 def normal_force(

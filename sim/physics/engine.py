@@ -18,6 +18,11 @@ from undulog.capture.robot.model import Robot
 
 from ..scenario.scenario import EngineKind, Kernels
 
+_TYPES = {
+    EngineKind.BULLET: ("undulog.sim.physics.bullet", "BulletEngine"),
+    EngineKind.MUJOCO: ("undulog.sim.physics.mujoco", "MujocoEngine"),
+}
+
 
 class BodyState(NamedTuple):
     """Where the body is and how it moves, in the world; the component comes first.
@@ -104,11 +109,6 @@ class BodyStart(NamedTuple):
 
 EngineType: TypeAlias = Callable[[Robot, BodyStart], Engine]
 """Builds a body; raises UsageError if the engine can't hold the robot."""
-
-_TYPES = {
-    EngineKind.BULLET: ("undulog.sim.physics.bullet", "BulletEngine"),
-    EngineKind.MUJOCO: ("undulog.sim.physics.mujoco", "MujocoEngine"),
-}
 
 
 def engine_type(kind: EngineKind, kernels: Kernels = Kernels.NUMPY) -> EngineType:

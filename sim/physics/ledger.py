@@ -55,6 +55,18 @@ OBSTACLE_TERMS = ("obstacle_friction", "obstacle_damping")
 PUSH_TERMS = ("push_work",)
 """What disturbances do to the robot [J], cumulative."""
 
+STORED_TERMS = (
+    *("kinetic", "potential", "contact_spring", "obstacle_spring"),
+    *("rotor_kinetic", "gear_spring"),
+)
+"""Energies stored at the instant [J]: those of the body and its contacts, those of the servos."""
+
+RESIDUAL_TERMS = ("mechanical_residual", "electrical_residual")
+"""Left side minus right side of the two balances since the start [J]: the ledger's own error."""
+
+TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + PUSH_TERMS + STORED_TERMS + RESIDUAL_TERMS
+"""All terms, in the order of :meth:`Ledger.read`."""
+
 
 def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
     """Energies that pass the joints during consecutive steps.
@@ -164,19 +176,6 @@ def _by_field(part: FloatArray) -> FloatArray:
 def _middle(series: FloatArray) -> FloatArray:
     """Means of neighbours in time, shape (k + 1, ...) to (k, ...)."""
     return 0.5 * (series[1:] + series[:-1])
-
-
-STORED_TERMS = (
-    *("kinetic", "potential", "contact_spring", "obstacle_spring"),
-    *("rotor_kinetic", "gear_spring"),
-)
-"""Energies stored at the instant [J]: those of the body and its contacts, those of the servos."""
-
-RESIDUAL_TERMS = ("mechanical_residual", "electrical_residual")
-"""Left side minus right side of the two balances since the start [J]: the ledger's own error."""
-
-TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + PUSH_TERMS + STORED_TERMS + RESIDUAL_TERMS
-"""All terms, in the order of :meth:`Ledger.read`."""
 
 
 class Ledger:

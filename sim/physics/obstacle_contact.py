@@ -43,6 +43,8 @@ from ..scenario.obstacles import (
 )
 from .contact import cross, normal_force
 
+_NONE = np.empty((3, 0))
+
 
 class ObstacleContact(NamedTuple):
     """All pairs of a link and an obstacle that touch, p of them, mostly none.
@@ -85,7 +87,6 @@ class ObstacleContact(NamedTuple):
         return layers
 
 
-_NONE = np.empty((3, 0))
 NO_CONTACT = ObstacleContact(np.empty(0, dtype=np.int64), _NONE, _NONE, _NONE, np.empty(0), _NONE)
 """Nothing touches."""
 

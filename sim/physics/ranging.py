@@ -41,6 +41,10 @@ from .contact import out_of_frames
 from .sensing import Mounts, RangeSample, Schedule, quantised
 from .steps import Steps
 
+_SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
 
 class RayCaster:
     """The obstacles of a world, ready for rays."""
@@ -224,9 +228,6 @@ class Ranging(Generic[_Model]):
         raise NotImplementedError
 
 
-_SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
-
-
 def voltage(distance: FloatArray, peak: float) -> FloatArray:
     """What the sensor's output is at a distance.
 
@@ -270,9 +271,6 @@ class Infrared(Ranging[InfraredModel]):
         return decoded(
             quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
         )
-
-
-_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 def cone(count: int, angle: float) -> FloatArray:

@@ -57,6 +57,12 @@ from .steps import Steps
 ACCELEROMETER_STREAM = 5
 """Number of the random stream that the sensors' noise is drawn from."""
 
+COMPASS_STREAM = 6
+"""Number of the random stream that the sensors' noise is drawn from."""
+
+STREAM = 1
+"""Number of the random stream that the servos' noise is drawn from."""
+
 
 class Accelerometer:
     """A robot's accelerometers, mostly one."""
@@ -150,10 +156,6 @@ def measured(sensors: Sequence[Sensor]) -> FloatArray:
     return np.array([[1.0 if axis in one.axes else np.nan for axis in "xyz"] for one in sensors])
 
 
-COMPASS_STREAM = 6
-"""Number of the random stream that the sensors' noise is drawn from."""
-
-
 def earth_field(model: CompassModel) -> FloatArray:
     """The earth's field in the world.
 
@@ -211,10 +213,6 @@ class Compass:
             VectorSample(self._names[i], float(k * self._dt), vector)
             for k, i, vector in zip(step.tolist(), which.tolist(), measured, strict=True)
         ]
-
-
-STREAM = 1
-"""Number of the random stream that the servos' noise is drawn from."""
 
 
 _Sensors: TypeAlias = Infrared | Sonar | Accelerometer | Compass

@@ -29,6 +29,11 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.strict_table import Table, above, at_most, listed
 from undulog.capture.robot.model import Robot
 
+_SLACK_S = 1e-9  # ticks and sums of decimal fractions differ in the last bit
+_TEXT = re.compile(r"(?P<what>[^@]*)(@(?P<from>[^+@]*)(\+(?P<for>[^+@]*))?)?")
+FORM = "KIND[:JOINT][:NUMBER][@FROM[+FOR]], e.g. lost:joint07:0.1 or bus-off@5+2"
+"""Form of a fault on the command line, for messages."""
+
 
 class FaultKind(StrEnum):
     """Kind of a fault."""
@@ -63,10 +68,6 @@ _GRAMMAR = {
     FaultKind.NOISE: _Grammar(False, ("a probability", 0.9)),  # frames are repeated until heard
     FaultKind.DELAY: _Grammar(False, ("a time in s", 10.0)),
 }
-_SLACK_S = 1e-9  # ticks and sums of decimal fractions differ in the last bit
-_TEXT = re.compile(r"(?P<what>[^@]*)(@(?P<from>[^+@]*)(\+(?P<for>[^+@]*))?)?")
-FORM = "KIND[:JOINT][:NUMBER][@FROM[+FOR]], e.g. lost:joint07:0.1 or bus-off@5+2"
-"""Form of a fault on the command line, for messages."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,11 @@ _TINY = 1e-300  # makes 0/0 a zero
 
 PositivePair: TypeAlias = Annotated[tuple[float, float], above(0.0)]
 
+STREAM = 2
+"""Number of the random stream that places and radii are drawn from."""
+
+_TRIES = 1000  # places tried for each cylinder
+
 
 class Closest(NamedTuple):
     """Where a segment and a shape are nearest.
@@ -350,11 +355,6 @@ def _rows(pairs: Sequence[tuple[float, float]]) -> FloatArray:
 
 
 Seed: TypeAlias = Annotated[int, at_least(0)]
-
-STREAM = 2
-"""Number of the random stream that places and radii are drawn from."""
-
-_TRIES = 1000  # places tried for each cylinder
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,14 @@ from .obstacles import Seed
 from .sensors import Noise, SensorModels
 from .world import Push, World, body_length, world_table
 
+MASS_FACTOR = "mass_factor"
+"""Multiplies a link's mass and its moments of inertia, as a denser material of that shape would."""
+
+LONGEST_S = 86400.0
+"""Longest run."""
+
+_PLAIN = ("duration_s", "settle_s", "seed", "epoch_s", "physics_rate_hz", "engine")
+
 
 class EngineKind(StrEnum):
     """The engines there are, each named after its package."""
@@ -76,9 +84,6 @@ class Kernels(StrEnum):
 
 Fields: TypeAlias = Mapping[str, float]
 """Parameter name to value."""
-
-MASS_FACTOR = "mass_factor"
-"""Multiplies a link's mass and its moments of inertia, as a denser material of that shape would."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,17 +175,11 @@ def _link_fields(table: Table) -> dict[str, float]:
     return given
 
 
-LONGEST_S = 86400.0
-"""Longest run."""
-
 Length: TypeAlias = Annotated[float, at_least(1 / CONTROL_RATE_HZ), at_most(LONGEST_S)]
 """Length of a run [s]."""
 PhysicsRate: TypeAlias = Annotated[int, at_least(2 * CONTROL_RATE_HZ)]
 Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
 """Unix time from 2001 on [s]: viewers misread stamps near zero."""
-
-
-_PLAIN = ("duration_s", "settle_s", "seed", "epoch_s", "physics_rate_hz", "engine")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ from undulog.capture.robot.model import Robot
 
 from .obstacles import Box, Cylinder, Obstacle, ObstacleMaterial, RandomField, Target, Wall
 
+STANDARD_GRAVITY = 9.81
+"""Default acceleration of gravity [m/s^2]."""
+
 
 class FrictionLaw(StrEnum):
     """How the ground resists a link that slips along it.
@@ -128,10 +131,6 @@ def _read_push(table: Table, robot: Robot | None) -> Push:
         table.fault("link", listed(names, push.link))
     table.close()
     return push
-
-
-STANDARD_GRAVITY = 9.81
-"""Default acceleration of gravity [m/s^2]."""
 
 
 @dataclass(frozen=True)

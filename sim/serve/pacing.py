@@ -24,6 +24,14 @@ from undulog.capture.common.clock import REAL, Clock
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import raised_priority
 
+PATIENCE_NS = 50_000_000
+"""So far behind the twin may be [ns] and still try to catch up. Its samples are two control periods
+old when they come; together that stays below the 0.1 s by which a recorder tells times that are
+late from a clock that was set back."""
+
+_ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
+_TOO_SLOW_S = 1.0  # a twin that stood still for so long would take a core from everything else
+
 
 def listen_on_loopback(host: str, port: int) -> socket.socket:
     """Listen on loopback.
@@ -55,15 +63,6 @@ def listen_on_loopback(host: str, port: int) -> socket.socket:
         listener.close()
         raise UsageError(f"can't serve at {host}:{port}: {error.strerror}") from error
     return listener
-
-
-PATIENCE_NS = 50_000_000
-"""So far behind the twin may be [ns] and still try to catch up. Its samples are two control periods
-old when they come; together that stays below the 0.1 s by which a recorder tells times that are
-late from a clock that was set back."""
-
-_ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
-_TOO_SLOW_S = 1.0  # a twin that stood still for so long would take a core from everything else
 
 
 @dataclass

@@ -27,6 +27,11 @@ _OF_JOINT = (
 )
 _PERIOD_NS = NS // CONTROL_RATE_HZ
 
+STREAM = 50
+"""Number of the random stream that decides which frames are hit."""
+
+_PROTOCOL_VIOLATION, _BUS_ERROR = 0x008, 0x080  # linux/can/error.h
+
 
 class ReplyEncoder:
     """Encodes samples of a robot's servos and sensors as frames.
@@ -153,12 +158,6 @@ class ReplyEncoder:
 
 def _numbers(values: FloatArray) -> list[float]:
     return values.tolist()
-
-
-STREAM = 50
-"""Number of the random stream that decides which frames are hit."""
-
-_PROTOCOL_VIOLATION, _BUS_ERROR = 0x008, 0x080  # linux/can/error.h
 
 
 class FaultLine:

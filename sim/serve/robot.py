@@ -39,6 +39,14 @@ WATCHDOG_S = 0.5
 
 _SLACK = 1e-9  # rad; a limit of 30 degrees and 30 degrees from the bus differ in the last bit
 
+PERIOD_NS = NS // CONTROL_RATE_HZ
+"""Control period [ns]."""
+
+_BEFORE_NS = 1_000_000  # the last pose that is sent before tick 0
+_JUST_BEFORE_NS = 1000  # the one sent after it: times on the bus are rounded to this
+_NAMED = 8
+_PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
+
 
 class CommandLatch:
     """The last command of each servo, which it holds until the next one comes.
@@ -115,15 +123,6 @@ class CommandLatch:
             Shape (m,).
         """
         return (self._time_ns >= 0) & (now_ns - self._time_ns > longest_ns)
-
-
-PERIOD_NS = NS // CONTROL_RATE_HZ
-"""Control period [ns]."""
-
-_BEFORE_NS = 1_000_000  # the last pose that is sent before tick 0
-_JUST_BEFORE_NS = 1000  # the one sent after it: times on the bus are rounded to this
-_NAMED = 8
-_PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 
 class _StoppedError(Exception):

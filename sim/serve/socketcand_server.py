@@ -41,6 +41,8 @@ _CHUNK = 1 << 14
 _UNSUPPORTED = ("add", "update", "delete", "subscribe", "unsubscribe", "filter", "muxfilter")
 _SEND = ("send", "sendrtr")
 
+_LONGEST_WAIT_S = 0.05
+
 
 class SocketcandServer:
     """Serves one bus.
@@ -291,9 +293,6 @@ class SocketcandServer:
         if client.watched:
             self._selector.unregister(client.sock)
         client.sock.close()
-
-
-_LONGEST_WAIT_S = 0.05
 
 
 class VirtualBus:

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 RANDOM_STREAM = 300
 """Of the scenario's seed; random turns draw from it and nothing else does."""
 
+AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
+_MODE_HOLD_S = 0.5
+_TURNING = 0.05  # offsets of the head above this are turns [rad]
+
 
 class StraightOn:
     """No course: on as the body lies."""
@@ -135,11 +139,6 @@ class TargetHeadingPolicy:
 
 HeadingPolicy: TypeAlias = StraightOn | RandomHeadingPolicy | TargetHeadingPolicy
 """Sets the offset of the head when nothing is in the way, and logs values by name."""
-
-
-AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
-_MODE_HOLD_S = 0.5
-_TURNING = 0.05  # offsets of the head above this are turns [rad]
 
 
 class AdaptiveGait:

@@ -41,6 +41,14 @@ SERVO = {
 
 GROUND = {"mu_tangential": "1", "mu_normal": "1"}
 
+STEP = 0.1
+"""h: every parameter is changed by a factor exp(+-0.1)."""
+
+REACH = 0.2
+"""Range of validity of the model: factors exp(+-0.2)."""
+
+HELD_OUT = 4
+
 
 class Variant(NamedTuple):
     """One run of the twin.
@@ -173,15 +181,6 @@ def response(
     amplitudes = np.asarray(fitted[1] + 1j * fitted[2], dtype=np.complex128)
     command, answer = amplitudes[: len(driven)], amplitudes[len(driven) :]
     return command, np.log(answer / command)
-
-
-STEP = 0.1
-"""h: every parameter is changed by a factor exp(+-0.1)."""
-
-REACH = 0.2
-"""Range of validity of the model: factors exp(+-0.2)."""
-
-HELD_OUT = 4
 
 
 def null_model(

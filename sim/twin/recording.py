@@ -44,6 +44,10 @@ from ..scenario.scenario_file import load_scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin
 
+_AHEAD = 100  # samples that the twin may be ahead of the recording
+
+_PERIOD_NS = NS // CONTROL_RATE_HZ
+
 
 @contextmanager
 def quick_collections() -> Generator[None]:
@@ -256,11 +260,6 @@ def record(
             if seconds > 0.0
         },
     )
-
-
-_AHEAD = 100  # samples that the twin may be ahead of the recording
-
-_PERIOD_NS = NS // CONTROL_RATE_HZ
 
 
 class TwinSource:

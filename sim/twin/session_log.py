@@ -46,6 +46,22 @@ from .twin import Sample, Twin
 _AXES = {Plane.HORIZONTAL: "0 0 1", Plane.VERTICAL: "0 1 0"}
 _ALONG_X = "0 1.5707963267948966 0"  # a URDF cylinder lies along z
 
+GAIT_UNIT = "rad, omega in rad/s"
+"""Unit of the values on ``/gait``."""
+
+_TF_EVERY = 5  # ticks: 20 Hz, a view aid
+_TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
+# Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged.
+_POWER_TERMS = {
+    PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
+    PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
+    PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
+    PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
+}
+
+# Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes.
+_POWER_PER_W = float(2**24)
+
 
 def urdf(robot: Robot) -> str:
     """Write the robot as URDF.
@@ -122,23 +138,6 @@ def _add_joint(root: ET.Element, joint: Joint, parent: str, child: str, at: floa
         velocity=repr(joint.max_velocity),
     )
     ET.SubElement(element, "dynamics", damping="0", friction="0")
-
-
-GAIT_UNIT = "rad, omega in rad/s"
-"""Unit of the values on ``/gait``."""
-
-_TF_EVERY = 5  # ticks: 20 Hz, a view aid
-_TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
-# Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged.
-_POWER_TERMS = {
-    PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
-    PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
-    PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
-    PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
-}
-
-# Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes.
-_POWER_PER_W = float(2**24)
 
 
 def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:

@@ -42,6 +42,22 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+ARENA_SIZE = 8 << 20
+SAME_SIZE = 9 << 18
+"""Bytes of blocks of one channel that share a buffer: about the size of a core's own cache. More
+would save nothing, since they have many messages of one topic."""
+
+_START = struct.Struct("<BQ")  # of a record: opcode, length
+_START_KIND = np.dtype(f"V{_START.size}")
+_CHANNEL_START = struct.Struct("<BQH")  # of a message: opcode, length, channel
+_CHANNEL_START_KIND = np.dtype(f"V{_CHANNEL_START.size}")
+_LOG_TIME_AT = 15
+_LOG_TIME_KIND = np.dtype("<i8")
+_FAR = 1 << 62
+_LARGEST_COPIED = 2048
+"""Records up to this many bytes are copied whole before they are read: then they are side by side
+in the cache."""
+
 
 def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
     """Yield items in order, each taken from the iterable before it is needed.
@@ -56,12 +72,6 @@ def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
         if len(waiting) > count:
             yield waiting.popleft()
     yield from waiting
-
-
-ARENA_SIZE = 8 << 20
-SAME_SIZE = 9 << 18
-"""Bytes of blocks of one channel that share a buffer: about the size of a core's own cache. More
-would save nothing, since they have many messages of one topic."""
 
 
 @dataclass(frozen=True)
@@ -177,17 +187,6 @@ def _alone(log_file: LogFile, block: Block) -> _Found:
         return error
     return data, Placed(block, base, stop)
 
-
-_START = struct.Struct("<BQ")  # of a record: opcode, length
-_START_KIND = np.dtype(f"V{_START.size}")
-_CHANNEL_START = struct.Struct("<BQH")  # of a message: opcode, length, channel
-_CHANNEL_START_KIND = np.dtype(f"V{_CHANNEL_START.size}")
-_LOG_TIME_AT = 15
-_LOG_TIME_KIND = np.dtype("<i8")
-_FAR = 1 << 62
-_LARGEST_COPIED = 2048
-"""Records up to this many bytes are copied whole before they are read: then they are side by side
-in the cache."""
 
 Window = tuple[int | None, int | None]
 

@@ -32,6 +32,9 @@ _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.na
 
 Matrix = NDArray[np.uint8]
 
+_COMPARED = 1 << 17
+"""Bytes of constant parts that are compared at once: they stay in the cache."""
+
 
 class Part(NamedTuple):
     """Messages of one layout.
@@ -190,10 +193,6 @@ def time_ns(sec: NDArray[Any], nanosec: NDArray[Any]) -> IntArray:
     ns *= NS
     ns += nanosec.astype(np.int64, copy=False)
     return ns
-
-
-_COMPARED = 1 << 17
-"""Bytes of constant parts that are compared at once: they stay in the cache."""
 
 
 class Stamping:

@@ -52,6 +52,22 @@ _RELEASES = (
     ((*_OLD,), False, ""),  # 1.0 to 2.5: Foxy, Galactic
 )
 
+_PER_MESSAGE = re.compile(r"^\s*compression_mode:\s*['\"]?message\b", re.IGNORECASE | re.MULTILINE)
+_COPY = "session.mcap"
+_STEP = 4096
+_ROS1 = ".bag"
+_FILES = (".db3", _ROS1)
+_RECORD_SIZE = 31
+"""Of a message's record in an MCAP, without the message [byte]."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_WHAT = (
+    (
+        "a rosbag2 recording",
+        "check metadata.yaml and the files it names, or run 'ros2 bag reindex'",
+    ),
+    ("a bag of ROS 1", "run 'rosbag reindex' or 'rosbag fix'"),
+)
+
 
 def _controller_states() -> Iterator[str]:
     """Yield the forms of the controller state, the newest first."""
@@ -139,23 +155,6 @@ class Ros1Types:
             return bytes(self._store.ros1_to_cdr(message, connection.msgtype))
         except Exception:  # noqa: BLE001  its decoder has errors of many bases
             return None
-
-
-_PER_MESSAGE = re.compile(r"^\s*compression_mode:\s*['\"]?message\b", re.IGNORECASE | re.MULTILINE)
-_COPY = "session.mcap"
-_STEP = 4096
-_ROS1 = ".bag"
-_FILES = (".db3", _ROS1)
-_RECORD_SIZE = 31
-"""Of a message's record in an MCAP, without the message [byte]."""
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-_WHAT = (
-    (
-        "a rosbag2 recording",
-        "check metadata.yaml and the files it names, or run 'ros2 bag reindex'",
-    ),
-    ("a bag of ROS 1", "run 'rosbag reindex' or 'rosbag fix'"),
-)
 
 
 def is_bag(path: Path) -> bool:

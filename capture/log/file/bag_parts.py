@@ -38,6 +38,8 @@ _SUFFIXES = (".mcap", ".db3")
 _MOST_TOPICS = 1 << 16
 _ROW_SIZE = 8  # of the shortest message in a database [byte]
 
+_REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
+
 
 class Allowance:
     """The bytes that a recording may expand to: so many times its own, or a least number."""
@@ -230,9 +232,6 @@ def read_database_facts(path: Path) -> Stated:
     if not (isinstance(first, int) and isinstance(last, int) and first >= 0):
         return Stated([path], "", messages=count, topics=names)
     return Stated([path], "", first, last - first, count, names)
-
-
-_REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
 
 
 def _database(base: sqlite3.Connection) -> Part:

@@ -34,6 +34,9 @@ from .parts import PART_RECORD, PartFiles, first_part, open_parts
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 """glibc's (malloc_trim(3)); other allocators have none."""
 
+RECOVER = "; 'undulog log recover' writes a whole file"
+"""Advice at the end of a warning."""
+
 
 def new_pages(size: int) -> mmap.mmap:
     """Return zeroed memory of small pages, which are allocated when they are first written.
@@ -110,10 +113,6 @@ class FilePages:
         if self._used and _TRIM is not None:
             _TRIM(0)
         self._used = bool(held)  # once more after the last one: it takes milliseconds
-
-
-RECOVER = "; 'undulog log recover' writes a whole file"
-"""Advice at the end of a warning."""
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ _FILES = (".mcap", ".db3", ".bag")
 _WAL = ".mcap.wal"
 _UNFINISHED = f".mcap{SUFFIX}"
 
+_MOST_LISTED = 20
+
 
 def part_path(first: Path, number: int) -> Path:
     """Return the file of a part, e.g. ``run_0002.mcap``; parts are numbered from 1."""
@@ -83,9 +85,6 @@ def later_parts(first: Path) -> list[Path]:
     paths = {_final(path) for path in first.parent.iterdir()}
     names = [(*split_part_path(path), path) for path in paths]
     return [path for head, number, path in sorted(names) if number > 1 and head == first]
-
-
-_MOST_LISTED = 20
 
 
 @dataclass

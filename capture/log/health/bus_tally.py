@@ -31,6 +31,20 @@ devices may send most frames of a bus."""
 
 _MOST_LISTED = 8
 
+SOURCE_PREFIX = "source "
+"""Start of the name of a source's status."""
+
+RECORDER = "recorder"
+"""Name of the recorder's own status."""
+
+ELAPSED = "elapsed_s"
+"""The recorder's time since its start [s], among its values."""
+
+FIRST_S = 5.0
+"""A file whose first diagnostics are later than this in the recording doesn't begin with it."""
+
+_COUNTS = ("frames", "dropped", "malformed", "error_frames", "reconnects", "clock_resets")
+
 
 def undecoded(
     robot: str, decoded: int, frames: int, others: Mapping[str, int], *, all_joints: bool
@@ -211,21 +225,6 @@ class BusTally:
             low, high = self._bits.pop(second)
             self._closed = self._closed[0] + low, self._closed[1] + high
             self._peak = max(self._peak[0], low), max(self._peak[1], high)
-
-
-SOURCE_PREFIX = "source "
-"""Start of the name of a source's status."""
-
-RECORDER = "recorder"
-"""Name of the recorder's own status."""
-
-ELAPSED = "elapsed_s"
-"""The recorder's time since its start [s], among its values."""
-
-FIRST_S = 5.0
-"""A file whose first diagnostics are later than this in the recording doesn't begin with it."""
-
-_COUNTS = ("frames", "dropped", "malformed", "error_frames", "reconnects", "clock_resets")
 
 
 @dataclass(frozen=True)

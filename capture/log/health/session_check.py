@@ -44,6 +44,8 @@ from .tallies import FileHealth
 
 _PIECE = 1 << 24
 
+CONTRACT_TOPICS = (COMMAND_TOPIC, RESPONSE_TOPIC)
+
 
 @dataclass
 class Container:
@@ -154,9 +156,6 @@ class SessionHealth(SessionMeasures):
     def reasons(self) -> tuple[str, ...]:
         """Why it is not better: joints that do not follow first, then heaviest first."""
         return (*(finding.sentence for finding in self.following), *super().reasons)
-
-
-CONTRACT_TOPICS = (COMMAND_TOPIC, RESPONSE_TOPIC)
 
 
 def check_session(

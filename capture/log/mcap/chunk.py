@@ -49,6 +49,19 @@ _COMPRESSION_NAME = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 
 Buffer = bytes | bytearray | mmap.mmap
 
+HEAD = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8")]
+)
+"""Start of a message record; the publish time and the message follow."""
+
+MESSAGE = struct.Struct("<BQHIQQ")
+"""Message record before the message: opcode, length, channel, sequence, log and publish time."""
+
+BODY_AT = MESSAGE.size
+"""Offset of the message in its record."""
+FIXED_SIZE = BODY_AT - PREFIX_SIZE
+"""Part of a record's length before the message."""
+
 
 class _Own(threading.local):
     """A decompressor and a buffer of compressed bytes for each thread."""
@@ -285,20 +298,6 @@ def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
             if at + PREFIX_SIZE + length == whole <= stop:
                 return at
     return None
-
-
-HEAD = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8")]
-)
-"""Start of a message record; the publish time and the message follow."""
-
-MESSAGE = struct.Struct("<BQHIQQ")
-"""Message record before the message: opcode, length, channel, sequence, log and publish time."""
-
-BODY_AT = MESSAGE.size
-"""Offset of the message in its record."""
-FIXED_SIZE = BODY_AT - PREFIX_SIZE
-"""Part of a record's length before the message."""
 
 
 def read_message_heads(

@@ -61,6 +61,9 @@ _INDEXED: dict[int, tuple[Opcode, Callable[[ReadDataStream], AttachmentIndex | M
     Opcode.METADATA_INDEX: (Opcode.METADATA, MetadataIndex.read),
 }
 
+_INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
+_NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
+
 
 class _NoSummaryError(Exception):
     """The file can't be opened from its summary."""
@@ -271,10 +274,6 @@ def _chunk_at(file: McapPayloads, start: int, stop: int) -> Block:
     if block is None:
         raise LogError(file.path, f"the chunk at byte {start} is cut in its header")
     return block
-
-
-_INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
-_NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
 
 
 class Contents:

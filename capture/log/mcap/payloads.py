@@ -33,6 +33,15 @@ from .chunk import (
 
 _CACHE_SIZE = 64 << 20
 
+_PAGE = HEAD_SIZE // 2
+_BATCH = 8 << 20
+"""Bytes of blocks that are fetched at a time, if they are expected."""
+
+_GAP = 64 << 10
+"""A smaller gap between two ranges is fetched with them: a request costs as much."""
+
+_CORRUPT = "is corrupt (its CRC doesn't fit)"
+
 
 class Cache:
     """Pieces that were read last, of all open files together, up to 64 MiB.
@@ -82,14 +91,6 @@ class Cache:
 
 cache = Cache()
 """The one of this process."""
-
-
-_PAGE = HEAD_SIZE // 2
-_BATCH = 8 << 20
-"""Bytes of blocks that are fetched at a time, if they are expected."""
-
-_GAP = 64 << 10
-"""A smaller gap between two ranges is fetched with them: a request costs as much."""
 
 
 class FetchedFile:
@@ -236,9 +237,6 @@ class FetchedFile:
             written = os.pwrite(self._descriptor, data, at)
             at, data = at + written, data[written:]
         self._pages.update(pages)
-
-
-_CORRUPT = "is corrupt (its CRC doesn't fit)"
 
 
 class McapPayloads:

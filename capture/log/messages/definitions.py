@@ -31,22 +31,6 @@ It goes up when a reader of the version before would take a new file for somethi
 topic, record or entry leaves it: earlier readers ignore it. Every earlier version is read.
 """
 
-
-def newer_contract(facts: Mapping[str, str]) -> str | None:
-    """Return a warning if a session follows a version that is not known here, else None.
-
-    Args:
-        facts: The metadata record ``undulog``.
-    """
-    stated = facts.get("contract", "")
-    if not (stated.isascii() and stated.isdigit()) or int(stated[:9]) <= CONTRACT_VERSION:
-        return None
-    return (
-        f"it follows version {stated[:9]} of the log contract, and this undulog reads up to "
-        f"{CONTRACT_VERSION}: what has changed since may be misread; update undulog"
-    )
-
-
 PRIMITIVES: dict[str, str] = {
     "bool": "u1",
     "byte": "u1",
@@ -80,6 +64,99 @@ _FIELD = re.compile(
     r"^(?P<base>[A-Za-z][\w/]*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z]\w*)"
     r"(?P<rest>.*)$"
 )
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
+"""Values without names and without a stamp."""
+
+JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE)
+"""Types whose messages each have one sample of some joints, and their names."""
+
+_BODIES: dict[str, str] = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "std_msgs/String": "string data\n",
+    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
+    "std_msgs/MultiArrayLayout": "MultiArrayDimension[] dim\nuint32 data_offset\n",
+    "std_msgs/UInt8MultiArray": "MultiArrayLayout layout\nuint8[] data\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
+    "geometry_msgs/Pose": "Point position\nQuaternion orientation\n",
+    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular\n",
+    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance\n",
+    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance\n",
+    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation\n",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\nTransform transform\n"
+    ),
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "nav_msgs/Odometry": (
+        "std_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
+    ),
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header\nstring[] name\n"
+        "float64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    ),
+    "sensor_msgs/Range": (
+        "uint8 ULTRASOUND=0\nuint8 INFRARED=1\nstd_msgs/Header header\nuint8 radiation_type\n"
+        "float32 field_of_view\nfloat32 min_range\nfloat32 max_range\nfloat32 range\n"
+        "float32 variance\n"
+    ),
+    "sensor_msgs/Imu": (
+        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+        "float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n"
+        "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+        "float64[9] linear_acceleration_covariance\n"
+    ),
+    "sensor_msgs/MagneticField": (
+        "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n"
+        "float64[9] magnetic_field_covariance\n"
+    ),
+    "sensor_msgs/TimeReference": (
+        "std_msgs/Header header\nbuiltin_interfaces/Time time_ref\nstring source\n"
+    ),
+    "diagnostic_msgs/KeyValue": "string key\nstring value\n",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n"
+        "byte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values\n"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\nDiagnosticStatus[] status\n",
+    "rcl_interfaces/Log": (
+        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
+        "string function\nuint32 line\n"
+    ),
+}
+
+VERDICTS = ("good", "degraded", "bad")
+"""Verdicts on a session, the worst last."""
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+
+NO_VALUES: Mapping[str, str] = MappingProxyType({})
+
+_LATCHED = re.compile(r"durability:\s*(1\b|transient_local)")
+
+
+def newer_contract(facts: Mapping[str, str]) -> str | None:
+    """Return a warning if a session follows a version that is not known here, else None.
+
+    Args:
+        facts: The metadata record ``undulog``.
+    """
+    stated = facts.get("contract", "")
+    if not (stated.isascii() and stated.isdigit()) or int(stated[:9]) <= CONTRACT_VERSION:
+        return None
+    return (
+        f"it follows version {stated[:9]} of the log contract, and this undulog reads up to "
+        f"{CONTRACT_VERSION}: what has changed since may be misread; update undulog"
+    )
 
 
 @dataclass(frozen=True)
@@ -201,75 +278,6 @@ class _Parser:
         return Field(match["name"], None, nested, length, array is not None)
 
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
-CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
-DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-FLOAT_ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
-"""Values without names and without a stamp."""
-
-JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE)
-"""Types whose messages each have one sample of some joints, and their names."""
-
-_BODIES: dict[str, str] = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "std_msgs/String": "string data\n",
-    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
-    "std_msgs/MultiArrayLayout": "MultiArrayDimension[] dim\nuint32 data_offset\n",
-    "std_msgs/UInt8MultiArray": "MultiArrayLayout layout\nuint8[] data\n",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
-    "geometry_msgs/Pose": "Point position\nQuaternion orientation\n",
-    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular\n",
-    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance\n",
-    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance\n",
-    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation\n",
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\nTransform transform\n"
-    ),
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "nav_msgs/Odometry": (
-        "std_msgs/Header header\nstring child_frame_id\n"
-        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
-    ),
-    "sensor_msgs/JointState": (
-        "std_msgs/Header header\nstring[] name\n"
-        "float64[] position\nfloat64[] velocity\nfloat64[] effort\n"
-    ),
-    "sensor_msgs/Range": (
-        "uint8 ULTRASOUND=0\nuint8 INFRARED=1\nstd_msgs/Header header\nuint8 radiation_type\n"
-        "float32 field_of_view\nfloat32 min_range\nfloat32 max_range\nfloat32 range\n"
-        "float32 variance\n"
-    ),
-    "sensor_msgs/Imu": (
-        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
-        "float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n"
-        "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
-        "float64[9] linear_acceleration_covariance\n"
-    ),
-    "sensor_msgs/MagneticField": (
-        "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n"
-        "float64[9] magnetic_field_covariance\n"
-    ),
-    "sensor_msgs/TimeReference": (
-        "std_msgs/Header header\nbuiltin_interfaces/Time time_ref\nstring source\n"
-    ),
-    "diagnostic_msgs/KeyValue": "string key\nstring value\n",
-    "diagnostic_msgs/DiagnosticStatus": (
-        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n"
-        "byte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values\n"
-    ),
-    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\nDiagnosticStatus[] status\n",
-    "rcl_interfaces/Log": (
-        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
-        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
-        "string function\nuint32 line\n"
-    ),
-}
-
-
 def is_of_contract(kind: MessageType) -> bool:
     """Whether a type is one of the log contract, with the same fields."""
     return _short(kind.name) in _BODIES and message_type(kind.name) == kind
@@ -314,10 +322,6 @@ def _collect(short: str, order: list[str]) -> None:
             _collect(dependency, order)
 
 
-VERDICTS = ("good", "degraded", "bad")
-"""Verdicts on a session, the worst last."""
-
-
 def stated_reasons(health: Mapping[str, str]) -> tuple[str, ...]:
     """Return the reasons of a record ``undulog.health``; what is no JSON list is one reason."""
     text = health.get("reasons", "[]")
@@ -326,12 +330,6 @@ def stated_reasons(health: Mapping[str, str]) -> tuple[str, ...]:
     except (ValueError, RecursionError):
         return (text,)
     return tuple(map(str, cast("list[object]", found) if isinstance(found, list) else [found]))
-
-
-OK, WARN, ERROR, STALE = 0, 1, 2, 3
-"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-
-NO_VALUES: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -368,9 +366,6 @@ class PowerTopic(StrEnum):
     """Motor voltage times motor current, signed."""
     ELECTRICAL_PLUS = "/joint_power/electrical_plus"
     """Its positive part."""
-
-
-_LATCHED = re.compile(r"durability:\s*(1\b|transient_local)")
 
 
 def is_latched(type_name: str, channel: Channel) -> bool:

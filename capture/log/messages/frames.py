@@ -95,6 +95,12 @@ DIR_RX = 0
 DIR_TX = 1
 """Sent by the recording computer."""
 
+FRAMES_TYPE = "std_msgs/msg/UInt8MultiArray"
+"""Type of a message of raw frames."""
+
+_PAIR = struct.Struct("<II")
+_COUNT = struct.Struct("<I")
+
 
 def bus_of(topic: str) -> str:
     """Return the name of the bus of a topic that begins with one of the prefixes above."""
@@ -215,13 +221,6 @@ def identifier_text(id_flags: int) -> str:
         E.g. ``14B`` or ``18FEF100``.
     """
     return f"{id_flags & ID_MASK:0{8 if id_flags & EXTENDED_FLAG else 3}X}"
-
-
-FRAMES_TYPE = "std_msgs/msg/UInt8MultiArray"
-"""Type of a message of raw frames."""
-
-_PAIR = struct.Struct("<II")
-_COUNT = struct.Struct("<I")
 
 
 @lru_cache(maxsize=4)

@@ -51,6 +51,13 @@ _JOINTS = "joint_names["
 _MOST_POINTS = 100_000
 _LATEST_NS = 1 << 61  # a later start is damage, and the times of its points have no place
 
+_TRAJECTORY_FIELDS = ["header", "joint_names", "points"]
+
+_U32, _TIME = struct.Struct("<I"), struct.Struct("<iI")
+
+_EARLY_OR_LATE = 0.1
+"""A joint that is missing for more than this part of the topic's span causes a warning."""
+
 
 @dataclass(frozen=True)
 class JointSource:
@@ -155,9 +162,6 @@ def _parts(field: Field | None) -> dict[str, Field]:
     return {} if nested is None else {part.name: part for part in nested.fields}
 
 
-_TRAJECTORY_FIELDS = ["header", "joint_names", "points"]
-
-
 def sampled(
     source: JointSource, type_name: str, group: Group, field: str
 ) -> tuple[tuple[str, ...], FloatArray]:
@@ -256,9 +260,6 @@ class Trajectory:
     names: tuple[str, ...]
     after_ns: IntArray
     values: Mapping[str, FloatArray]
-
-
-_U32, _TIME = struct.Struct("<I"), struct.Struct("<iI")
 
 
 class _Cursor:
@@ -376,10 +377,6 @@ def points_in_force(
         for names, own in parts.items()
     ]
     return found, replaced
-
-
-_EARLY_OR_LATE = 0.1
-"""A joint that is missing for more than this part of the topic's span causes a warning."""
 
 
 @dataclass(frozen=True)

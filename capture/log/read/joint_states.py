@@ -43,6 +43,19 @@ SLACK_NS = 5 * NS
 NEAR_NS = NS // 4
 """The same for logs of undulog, if the samples read cover the window."""
 
+_MEASURED = (
+    "/joint_states",
+    "/joint_velocity",
+    "/joint_effort",
+    "/joint_current",
+    "/joint_voltage",
+    "/joint_temperature",
+)
+OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
+    "/joint_commands": "/joint_command_offset"
+}
+"""Topic to the topic of its joints' sampling times relative to the stamp."""
+
 
 def widened(window_ns: Window, slack_ns: int) -> Window:
     """Return a window of log times for one of sampling times.
@@ -71,20 +84,6 @@ def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
         if (stamps[1:] < stamps[:-1]).any():
             return False
     return True
-
-
-_MEASURED = (
-    "/joint_states",
-    "/joint_velocity",
-    "/joint_effort",
-    "/joint_current",
-    "/joint_voltage",
-    "/joint_temperature",
-)
-OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
-    "/joint_commands": "/joint_command_offset"
-}
-"""Topic to the topic of its joints' sampling times relative to the stamp."""
 
 
 class JointReader:

@@ -50,6 +50,27 @@ _MOST_TOPICS = 2000
 
 _MOST_LISTED = 12
 
+CONTRACT_TOPICS = frozenset(
+    {
+        *("/joint_sample_offset", "/joint_command_offset", "/joint_velocity", "/joint_effort"),
+        *("/joint_current", "/joint_voltage", "/joint_temperature", "/gait", "/gate/wanted"),
+        *("/energy_ledger", *PowerTopic),
+    }
+)
+"""JointStates of the log contract that are neither commands nor positions."""
+
+_COMMAND_WORDS = {"command", "commands", "cmd", "cmds", "target", "targets", "desired", "goal"} | {
+    *("goals", "reference", "references", "setpoint", "setpoints", "action", "actions")
+}
+_NO_ANGLES = {"velocity", "velocities", "effort", "efforts", "torque", "torques", "current"}
+_FEW_LISTED = 8
+
+HOW_TO_CHOOSE = "choose with --command-topic and --response-topic"
+_NO_QUANTITIES: Mapping[str, str] = MappingProxyType({})
+
+_UNNAMED = 3
+"""Rank of a JointState whose name says nothing: taken if it is the only one."""
+
 
 def joint_names(topics: Topics) -> dict[str, tuple[str, ...]]:
     """Return the joints of each topic that names some, in the order in which they appear.
@@ -136,25 +157,6 @@ def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) 
             f"{path}: its joints are not those of {robot}: the description {', and '.join(faults)}"
             " (undulog robot new --from writes one for a log)"
         )
-
-
-CONTRACT_TOPICS = frozenset(
-    {
-        *("/joint_sample_offset", "/joint_command_offset", "/joint_velocity", "/joint_effort"),
-        *("/joint_current", "/joint_voltage", "/joint_temperature", "/gait", "/gate/wanted"),
-        *("/energy_ledger", *PowerTopic),
-    }
-)
-"""JointStates of the log contract that are neither commands nor positions."""
-
-_COMMAND_WORDS = {"command", "commands", "cmd", "cmds", "target", "targets", "desired", "goal"} | {
-    *("goals", "reference", "references", "setpoint", "setpoints", "action", "actions")
-}
-_NO_ANGLES = {"velocity", "velocities", "effort", "efforts", "torque", "torques", "current"}
-_FEW_LISTED = 8
-
-HOW_TO_CHOOSE = "choose with --command-topic and --response-topic"
-_NO_QUANTITIES: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -464,10 +466,6 @@ class JointTopicFinder:
             return None if first is None else layout_of(self._topics.message_type(topic), first)
         except DataError:  # whoever reads the topic reports it
             return None
-
-
-_UNNAMED = 3
-"""Rank of a JointState whose name says nothing: taken if it is the only one."""
 
 
 def _of_angles(topic: str) -> bool:

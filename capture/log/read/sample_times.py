@@ -33,6 +33,21 @@ MOST_JOINTS = 2000
 LARGEST = 1e100
 """A larger value counts as missing: no sensor sends it, and its powers are not finite."""
 
+BREAK_S = 10.0
+"""A session breaks if none of its channels has a sample for longer than this [s]; shorter gaps are
+losses, which the estimators allow."""
+
+BREAK_INTERVALS = 10
+"""Shortest break in median intervals, for slow channels."""
+
+_FAR_STAMP_NS = 3600 * NS
+"""Stamps further than this from the log time are on another clock."""
+
+_NEVER_NS = 2**62
+"""A log time beyond this [Unix ns], the year 2116, is damage."""
+
+_FAR_NS = 2.0**60
+
 
 @dataclass(frozen=True)
 class Signal:
@@ -114,14 +129,6 @@ class JointSignals:
         frame["t_ns"] = np.concatenate([*self.t_ns, np.empty(0, dtype=np.int64)])
         frame[f"{self.field} [{self.unit}]"] = np.concatenate([*self.values, np.empty(0)])
         return frame
-
-
-BREAK_S = 10.0
-"""A session breaks if none of its channels has a sample for longer than this [s]; shorter gaps are
-losses, which the estimators allow."""
-
-BREAK_INTERVALS = 10
-"""Shortest break in median intervals, for slow channels."""
 
 
 @dataclass(frozen=True)
@@ -213,13 +220,6 @@ def _length(seconds: float) -> str:
     return f"{seconds:.1f} s"
 
 
-_FAR_STAMP_NS = 3600 * NS
-"""Stamps further than this from the log time are on another clock."""
-
-_NEVER_NS = 2**62
-"""A log time beyond this [Unix ns], the year 2116, is damage."""
-
-
 class StampClock:
     """The shift from header stamps to the log's clock, found once per session."""
 
@@ -271,9 +271,6 @@ def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
     """Return the shift to add to a stamp [ns], in whole seconds; 0 on the same clock."""
     apart_ns = log_ns - stamp_ns
     return round(apart_ns / NS) * NS if abs(apart_ns) > _FAR_STAMP_NS else 0
-
-
-_FAR_NS = 2.0**60
 
 
 @dataclass(frozen=True)

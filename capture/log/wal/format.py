@@ -39,6 +39,28 @@ from ...common.part_files import present_path, remove_opened
 
 LOCK_NAME = "recorder.lock"
 
+MAGIC = b"\x89UWAL1\r\n"
+MARK = 0xA5
+"""Mark in every record for a quick search for the next whole record."""
+
+HEADER_SIZE = 64
+RECORD_SIZE = 40
+"""Bytes of a record before its payload."""
+
+MAX_PAYLOAD = 256 << 20
+"""Longest payload [byte]; a length beyond it is damage."""
+
+RECORD_CRC = struct.Struct("<I")
+RECORD_BODY = struct.Struct("<IQBBHIQQ")
+_HEADER_BODY = struct.Struct("<8sIIQQ16s")
+
+_MCAP_PREFIX = 9  # opcode and length, which the record has already
+
+MESSAGES, DEFINITIONS = 0, 1
+"""The two streams of a log."""
+
+_NAME = re.compile(r"(def-)?(\d{6,19})\.seg")
+
 
 class WalLock:
     """A lock that a recorder holds from the creation of its log to the end."""
@@ -95,20 +117,6 @@ def is_live(folder: Path) -> bool:
 Definition = Header | Schema | Channel | Metadata | Attachment
 """A definition, as a record of the MCAP library."""
 
-MAGIC = b"\x89UWAL1\r\n"
-MARK = 0xA5
-"""Mark in every record for a quick search for the next whole record."""
-
-HEADER_SIZE = 64
-RECORD_SIZE = 40
-"""Bytes of a record before its payload."""
-
-MAX_PAYLOAD = 256 << 20
-"""Longest payload [byte]; a length beyond it is damage."""
-
-RECORD_CRC = struct.Struct("<I")
-RECORD_BODY = struct.Struct("<IQBBHIQQ")
-_HEADER_BODY = struct.Struct("<8sIIQQ16s")
 
 RecordFields = tuple[int, int, int, int, int, int, int]
 """Position, kind, mark, channel id, sequence, log time, publish time: :class:`RecordHead` without
@@ -122,15 +130,10 @@ _KINDS: dict[type[Definition], int] = {
     Attachment: Opcode.ATTACHMENT,
 }
 _TYPES = {kind: record for record, kind in _KINDS.items()}
-_MCAP_PREFIX = 9  # opcode and length, which the record has already
 
-MESSAGES, DEFINITIONS = 0, 1
-"""The two streams of a log."""
 
 STREAM_KINDS = {MESSAGES: frozenset({int(Opcode.MESSAGE)}), DEFINITIONS: frozenset(_TYPES)}
 """The kinds of record that a stream has."""
-
-_NAME = re.compile(r"(def-)?(\d{6,19})\.seg")
 
 
 class RecordHead(NamedTuple):

@@ -58,6 +58,21 @@ _SA_SIGINFO = 4
 _BUS_ADRERR = 2  # beyond the end of a mapped file
 _ADDRESS_AT = 16  # of si_addr in siginfo_t, on 64-bit systems
 
+_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+
+SEGMENT_OVERHEAD = 2 * HEADER_SIZE
+"""Bytes of a segment that hold no records."""
+
+_MS_SYNC = 4
+_MADV_POPULATE_WRITE = 23  # Linux 5.14; Python's mmap.madvise() keeps the interpreter's lock
+_PAGE = mmap.PAGESIZE
+_BUSY = 8 * _PAGE  # so many bytes between two syncs: the last page is young enough to wait
+
+RESERVED_SPACE_NAME = "ballast"
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Error numbers of a lack of free space."""
+
 
 class _Action(ctypes.Structure):
     """``struct sigaction`` of glibc and musl."""
@@ -68,9 +83,6 @@ class _Action(ctypes.Structure):
         ("flags", ctypes.c_int),
         ("restorer", ctypes.c_void_p),
     )
-
-
-_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 
 
 @dataclass
@@ -137,15 +149,6 @@ class _Watch:
 
 
 _WATCH = _Watch()
-
-
-SEGMENT_OVERHEAD = 2 * HEADER_SIZE
-"""Bytes of a segment that hold no records."""
-
-_MS_SYNC = 4
-_MADV_POPULATE_WRITE = 23  # Linux 5.14; Python's mmap.madvise() keeps the interpreter's lock
-_PAGE = mmap.PAGESIZE
-_BUSY = 8 * _PAGE  # so many bytes between two syncs: the last page is young enough to wait
 
 
 def free_bytes(path: Path) -> int:
@@ -383,12 +386,6 @@ def _reservation_error(path: Path, size: int, error: OSError) -> LogWriteError:
         if error.errno == errno.ENOSPC and free < size:
             return LogWriteError(path, _shortage(size, free))
     return LogWriteError(path, f"{size} bytes can't be reserved: {error.strerror}")
-
-
-RESERVED_SPACE_NAME = "ballast"
-
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Error numbers of a lack of free space."""
 
 
 class ReservedSpace:

@@ -26,6 +26,9 @@ _BULKY = frozenset(
     {"sensor_msgs/msg/JointState", "std_msgs/msg/UInt8MultiArray", "tf2_msgs/msg/TFMessage"}
 )
 
+PROFILE = "ros2"
+"""MCAP profile of a log to the contract."""
+
 
 def chunk_group(topic: str, type_name: str) -> str:
     """Return the group of a channel: channels of one group share chunks.
@@ -82,10 +85,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be finalised.
         """
-
-
-PROFILE = "ros2"
-"""MCAP profile of a log to the contract."""
 
 
 class McapSink:

@@ -32,6 +32,15 @@ MARK_RECORD = "undulog.mark"
 
 _YIELD_EVERY = 64
 
+MAX_BYTES = 512 << 20
+"""Most bytes that a ring holds by default, whatever its duration."""
+
+MAX_WAITING = 4
+"""Most marks that wait to be written: each holds the memory of a ring."""
+
+MESSAGE_OVERHEAD = 248
+"""Memory of a message beside its payload [B], measured."""
+
 
 class RingMessage(NamedTuple):
     """The arguments of :meth:`MessageSink.write`."""
@@ -58,16 +67,6 @@ class Mark:
     start_ns: int | None
     stop_ns: int | None
     error: LogWriteError | None
-
-
-MAX_BYTES = 512 << 20
-"""Most bytes that a ring holds by default, whatever its duration."""
-
-MAX_WAITING = 4
-"""Most marks that wait to be written: each holds the memory of a ring."""
-
-MESSAGE_OVERHEAD = 248
-"""Memory of a message beside its payload [B], measured."""
 
 
 class RingSink:
