@@ -97,20 +97,20 @@ def integrate(
     Returns:
         The energies of each, or None where the window has no samples of it.
     """
-    found: list[Energy | None] = []
+    energies: list[Energy | None] = []
     last: Weighed | None = None
     for power in powers:
         part = power.between(start_s, stop_s)
         if part.count < 2:
-            found.append(None)
+            energies.append(None)
             continue
         if last is None or not np.array_equal(last.t_s, part.t_s):
             last = weigh(part.t_s, start_s, stop_s, cycles)
         work = last.weights * part.values
         net = cycle_sums(work, last.starts)
         plus = cycle_sums(np.maximum(work, 0.0, out=work), last.starts)
-        found.append(Energy(net, plus, last.coverage, last.covered))
-    return found
+        energies.append(Energy(net, plus, last.coverage, last.covered))
+    return energies
 
 
 def add_up(net: Series, plus: Series, start_s: float, stop_s: float, cycles: int) -> Energy | None:
@@ -211,7 +211,7 @@ def joint_energies(
 
     def of_joint(name: str) -> Energies:
         powers: dict[str, Series] = {}
-        found: dict[str, Energy | None] = {}
+        energies: dict[str, Energy | None] = {}
         window = span.start_s, span.stop_s, max(span.cycles, 1)
         for kind, (first, second), wrong in (
             ("mechanical", (columns.effort, columns.velocity), false),
@@ -219,18 +219,18 @@ def joint_energies(
         ):
             if name in wrong:  # what accumulates powers goes by the same sensors
                 continue
-            found[kind] = _accumulated(columns, kind, name, span.origin_ns, window)
-            if found[kind] is None and name in first and name in second:
+            energies[kind] = _accumulated(columns, kind, name, span.origin_ns, window)
+            if energies[kind] is None and name in first and name in second:
                 powers[kind] = power_of(first[name], second[name], span.origin_ns)
-        found |= zip(powers, integrate([*powers.values()], *window), strict=True)
-        return Energies(found.get("mechanical"), found.get("electrical"), frozenset(powers))
+        energies |= zip(powers, integrate([*powers.values()], *window), strict=True)
+        return Energies(energies.get("mechanical"), energies.get("electrical"), frozenset(powers))
 
     samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
     found = in_threads(of_joint, columns.names, samples, session.forget)
     result = dict(zip(columns.names, found, strict=True))
 
-    def has_gaps(one: Energies) -> bool:
-        both = one.mechanical, one.electrical
+    def has_gaps(energies: Energies) -> bool:
+        both = energies.mechanical, energies.electrical
         return any(each is not None and each.coverage < 1 - GAP_SHARE for each in both)
 
     if thin := [name for name, one in result.items() if has_gaps(one)]:
@@ -269,11 +269,11 @@ def energy_result(
     joints = [
         JointCycles(
             name,
-            **{f"{term}_j": _each(one.per_cycle(term)) for term in TERMS},
-            coverage=_each(None if one.mechanical is None else one.mechanical.covered),
-            el_coverage=_each(None if one.electrical is None else one.electrical.covered),
+            **{f"{term}_j": _each(energy.per_cycle(term)) for term in TERMS},
+            coverage=_each(None if energy.mechanical is None else energy.mechanical.covered),
+            el_coverage=_each(None if energy.electrical is None else energy.electrical.covered),
         )
-        for name, one in energies.items()
+        for name, energy in energies.items()
     ]
     if (source := electrical_source(session, columns)) == "supply":
         warn(
@@ -307,7 +307,7 @@ def electrical_source(session: SessionView, columns: Columns) -> str | None:
 
 def _unknown(energies: Iterable[Energies]) -> str | None:
     """What the log leaves open, in one sentence."""
-    sampled = frozenset[str]().union(*(one.sampled for one in energies))
+    sampled = frozenset[str]().union(*(energy.sampled for energy in energies))
     factors = {"mechanical": "torque and velocity", "electrical": "voltage and current"}
     parts = [f"{kind} energies are products of sampled {factors[kind]}" for kind in sorted(sampled)]
     if not parts:
@@ -445,7 +445,9 @@ def transport(
         warn(Note(f"cost of transport is not applicable: {why}"))
         return Transport(distance, mass, *[nothing] * 5, why=why)
     weighed = steps.mass_kg * GRAVITY * steps.forward_m
-    sums = {name: in_all([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
+    sums = {
+        name: in_all([energy.per_cycle(name) for energy in energies.values()]) for name in TERMS
+    }
     kinds = dict.fromkeys(TERMS[name][0] for name, total in sums.items() if total is None)
     lacking = [f"no {kind} energy of some joints" for kind in kinds]
     if lacking:

@@ -83,15 +83,15 @@ def build_views(content: Content) -> Views:
     angles, effort = _angle_views(content), _effort_views(content)
     bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
     if content.live:  # nothing comes after the cursor
-        for one in (*angles, *effort):
-            one.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
+        for angle in (*angles, *effort):
+            angle.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
     return Views(
         scene=_body_view(content),
         mode=mode if content.modes else None,
         words=words,
         angles=angles,
         effort=effort,
-        bars=[bar_chart(one.title, f"{SEGMENTS}/{one.key}/**") for one in content.charts],
+        bars=[bar_chart(chart.title, f"{SEGMENTS}/{chart.key}/**") for chart in content.charts],
         maps=[
             rrb.Spatial2DView(name=one.title, origin=one.entity, visual_bounds=bounds)
             for one in content.maps
@@ -168,16 +168,16 @@ def _grid_spacing(span: float) -> float:
 
 
 def _effort_views(content: Content) -> list[rrb.View]:
-    found: list[rrb.View] = []
+    views: list[rrb.View] = []
     if content.has_power:
-        found.append(plot("Power [W]", [f"{entities.TOTAL}/**"]))
+        views.append(plot("Power [W]", [f"{entities.TOTAL}/**"]))
     if content.joint_power:
-        found.append(_joint_plot("Joint power [W]", content.joint_power, None))
-    found += [
+        views.append(_joint_plot("Joint power [W]", content.joint_power, None))
+    views += [
         _joint_plot(signal.title, signal.series, None, legend=not signal.of_joints)
         for signal in content.signals
     ]
-    return found
+    return views
 
 
 def bar_chart(title: str, contents: str) -> rrb.BarChartView:
@@ -190,11 +190,11 @@ def _mean_plots(content: Content) -> list[rrb.View]:
     mean = content.mean
     if mean is None:
         return []
-    found: list[rrb.View] = []
+    views: list[rrb.View] = []
     if mean.has_places:
         corner = rrb.Corner2D.LeftBottom  # where a sine isn't
         contents = [f"{mean_cycle.PLACES}/**"]
-        found.append(_whole_plot("Mean angle [°]", contents, legend=corner))
+        views.append(_whole_plot("Mean angle [°]", contents, legend=corner))
     names = _plane_of_places(content)
     for title, series, shown in (
         ("Mean angle of all joints [°]", mean.measured, names),
@@ -202,9 +202,9 @@ def _mean_plots(content: Content) -> list[rrb.View]:
         ("Mean power [W]", mean.power, None),
     ):
         if series:
-            contents = [one.entity for one in series]
-            found.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
-    return found
+            contents = [series.entity for series in series]
+            views.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
+    return views
 
 
 def _angle_views(content: Content) -> list[rrb.View]:
@@ -240,22 +240,22 @@ def _joint_plot(
     title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """Return a plot with a line for each joint; ``names`` are visible at first."""
-    contents = [one.entity for one in series]
+    contents = [series.entity for series in series]
     return plot(title, contents, overrides=_lines(series, names), legend=legend)
 
 
 def _lines(
     series: Sequence[Series], names: set[str] | None
 ) -> dict[EntityPathLike, rrb.Visualizer]:
-    found: dict[EntityPathLike, rrb.Visualizer] = {}
+    visualizers: dict[EntityPathLike, rrb.Visualizer] = {}
     for one in series:
         shown = [names is None or name in names for name in one.names]
         source = VisualizerComponentMapping(
             entities.SCALARS, ComponentSourceKind.SourceComponent, source_component=one.component
         )
         look = rr.SeriesLines.from_fields(visible_series=shown)
-        found[one.entity] = look.visualizer(mappings=[source])
-    return found
+        visualizers[one.entity] = look.visualizer(mappings=[source])
+    return visualizers
 
 
 def _whole_plot(

@@ -143,8 +143,12 @@ def saved(session: SessionView, paths: Sequence[Path], options: Options | None =
         DataError: If one holds no result, one that names no session, one of other sessions, or a
             second one with numbers of this session.
     """
-    known = read_results(session, paths)
-    return known if known.analysis is not None else known.with_numbers(computed(session, options))
+    results = read_results(session, paths)
+    return (
+        results
+        if results.analysis is not None
+        else results.with_numbers(computed(session, options))
+    )
 
 
 def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:

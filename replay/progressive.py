@@ -86,10 +86,10 @@ def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
     has_power = bool(content.joint_power)
     quantities = (GAIN, LAG, *((ENERGY,) if has_power else ()))
     # What is one a cycle is so in its bar.
-    units = [one.unit.partition("/")[0] for one in quantities]
+    units = [quantity.unit.partition("/")[0] for quantity in quantities]
     charts = tuple(
-        Chart(one.key, f"{one.name} [{unit}]", ())
-        for one, unit in zip(quantities, units, strict=True)
+        Chart(quantity.key, f"{quantity.name} [{unit}]", ())
+        for quantity, unit in zip(quantities, units, strict=True)
     )
     if rhythm is None:
         return replace(content, charts=charts)
@@ -102,7 +102,9 @@ def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
         maps=tuple(
             AwaitedMap(f"{MAPS}/{one.key}", f"{one.name} map [{one.unit}]") for one in mapped
         ),
-        cycles=tuple((one, (Series(f"{CYCLES}/{one.key}", measured),)) for one in quantities),
+        cycles=tuple(
+            (quantity, (Series(f"{CYCLES}/{quantity.key}", measured),)) for quantity in quantities
+        ),
         mean=MeanCycle(
             period_s=float(np.ptp(rhythm.t_ns)) * 1e-9 / cycles,
             has_body=content.start is not None,
@@ -134,7 +136,7 @@ def _arrangement(content: Content) -> tuple[object, ...]:
 
 
 def _names(series: tuple[Series, ...]) -> tuple[str, ...]:
-    return tuple(name for one in series for name in one.names)
+    return tuple(name for series in series for name in series.names)
 
 
 def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
@@ -321,12 +323,12 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     while (layer := numbers.draw()) is None:
         sink.look()
         time.sleep(_TAKE_S)
-    told = drawing.write_facts(session, layer, drawing.content)
+    facts = drawing.write_facts(session, layer, drawing.content)
     keeps = task.front == "session" and same_arrangement(early, drawing.content)
     # A layout that turned out right is left as it is: the user keeps his tabs and his cameras.
     rec.send_blueprint(build_blueprint(drawing.content, task.front), make_active=not keeps)
     sink.hand_over(rec)
-    return tuple(told)
+    return tuple(facts)
 
 
 class _Numbers:

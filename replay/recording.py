@@ -108,9 +108,9 @@ def write_recording(
         drawing.write_words()
         drawing.write_others()
         drawing.write_cycles(layer)
-        found = drawing.write_facts(session, layer, drawing.content)
+        facts = drawing.write_facts(session, layer, drawing.content)
         rec.send_blueprint(layout(drawing.content))
-    return Recording(path, identity, drawing.content, tuple(found))
+    return Recording(path, identity, drawing.content, tuple(facts))
 
 
 @contextmanager

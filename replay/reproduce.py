@@ -58,7 +58,7 @@ class LogDifference:
         return not (self.differs_s or self.one_sided)
 
 
-def compare_logs(one: Path, other: Path) -> LogDifference:
+def compare_logs(path: Path, other: Path) -> LogDifference:
     """Compare two sessions, topic by topic.
 
     Args:
@@ -67,7 +67,7 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
     Raises:
         LogError: If one can't be read.
     """
-    with RawLog(one) as first, RawLog(other) as second:
+    with RawLog(path) as first, RawLog(other) as second:
         channels = first.file.channels, second.file.channels
         own, others = ({one.topic: key for key, one in log.items()} for log in channels)
         same: list[str] = []

@@ -339,7 +339,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         """Return the errors that the views report."""
         self.picture()
         views = self._asked(self._client.get_state).views
-        return [f"{view.name}: {one.summary}" for view in views for one in view.reports]
+        return [f"{view.name}: {report.summary}" for view in views for report in view.reports]
 
     def picture(self, view: str | None = None) -> bytes:
         """Return a picture, once two shots in a row agree.

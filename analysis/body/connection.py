@@ -246,8 +246,8 @@ def fit_connection(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) ->
     Raises:
         DataError: If they are too few or too much alike; it names the condition number.
     """
-    base = shape_base(np.stack([one.shape for one in cycles]), most_modes)
-    perturbations = [base.perturbation(one.shape)[0] for one in cycles]
+    base = shape_base(np.stack([cycle.shape for cycle in cycles]), most_modes)
+    perturbations = [base.perturbation(cycle.shape)[0] for cycle in cycles]
     condition = condition_of(cycles, most_modes)
     count, needed = len(cycles), f"at least {MIN_GAITS} gaits around one gait are needed"
     number = f"the condition number is {condition:.3g}, at most {MOST_CONDITION:g} is of use"
@@ -260,8 +260,8 @@ def fit_connection(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) ->
 
 def condition_of(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) -> float:
     """Return the condition number of the shapes and rates of shape that gaits show."""
-    base = shape_base(np.stack([one.shape for one in cycles]), most_modes)
-    return _condition(base, [base.perturbation(one.shape)[0] for one in cycles])
+    base = shape_base(np.stack([cycle.shape for cycle in cycles]), most_modes)
+    return _condition(base, [base.perturbation(cycle.shape)[0] for cycle in cycles])
 
 
 def distances(cycles: Sequence[GaitCycle]) -> FloatArray:
@@ -273,7 +273,7 @@ def distances(cycles: Sequence[GaitCycle]) -> FloatArray:
     Returns:
         Shape (g,), 0 for the central gait itself; a shift in phase is no difference.
     """
-    first = np.stack([one.shape[:, 1] for one in cycles])
+    first = np.stack([cycle.shape[:, 1] for cycle in cycles])
     central = _central(first)
     phase = np.angle(first @ central.conj())
     off = first * np.exp(-1j * phase)[:, None] - central
@@ -287,15 +287,15 @@ def _fitted(
     cycles: Sequence[GaitCycle],
 ) -> Connection:
     """Fit A and B."""
-    rows = np.stack([_rows(base, one, _GRID) for one in perturbations])
+    rows = np.stack([_rows(base, perturbation, _GRID) for perturbation in perturbations])
     velocity = np.stack(
-        [wave_at(turned(one.velocity, base.phase(one.shape)), _GRID).T for one in cycles]
+        [wave_at(turned(cycle.velocity, base.phase(cycle.shape)), _GRID).T for cycle in cycles]
     )
     free = null_space(_same_gait(base), rcond=_CLOSED)
     power, vectors = np.linalg.eigh(np.einsum("gnq,gnr->qr", rows @ free, rows @ free))
     shown = power > power[-1] / MOST_CONDITION**2
-    own, hidden = free @ vectors[:, shown], free @ vectors[:, ~shown]
-    gram = own / power[shown] @ own.T
+    row, hidden = free @ vectors[:, shown], free @ vectors[:, ~shown]
+    gram = row / power[shown] @ row.T
     coefficients = gram @ np.einsum("gnq,gnc->qc", rows, velocity)
     left = velocity - rows @ coefficients
     count, k = len(cycles), base.share.size
@@ -303,13 +303,13 @@ def _fitted(
     leverage = np.zeros(count)
     steps = np.zeros((count, 3))
     alone = np.zeros((count, 3))
-    for g, own in enumerate(rows):
+    for g, row in enumerate(rows):
         # (I - H)^-1 by eigenvectors; a direction that only this gait shows is no direction.
-        shares, vectors = np.linalg.eigh(own @ gram @ own.T)
+        shares, vectors = np.linalg.eigh(row @ gram @ row.T)
         shares = np.clip(shares, 0.0, _ALONE)
         without: FloatArray = vectors @ ((vectors.T @ left[g]) / (1 - shares)[:, None])
-        change[g] = gram @ own.T @ without
-        leverage[g] = float(np.sum(shares / (1 - shares))) / len(own)
+        change[g] = gram @ row.T @ without
+        leverage[g] = float(np.sum(shares / (1 - shares))) / len(row)
         steps[g] = step_of_cycle(_fine(velocity[g]))
         alone[g] = step_of_cycle(_fine(velocity[g] - without))
     centred = change - change.mean(axis=0)
@@ -382,8 +382,10 @@ def _same_gait(base: ShapeBase) -> FloatArray:
 
 def _condition(base: ShapeBase, perturbations: Sequence[ComplexArray]) -> float:
     """Return the worst condition number of r' and d over the phases; a shift in phase is known."""
-    off = np.stack([wave_at(one, _GRID) for one in perturbations])
-    rate = np.stack([wave_at(_rate(base.cycle + one), _GRID) for one in perturbations])
+    off = np.stack([wave_at(perturbation, _GRID) for perturbation in perturbations])
+    rate = np.stack(
+        [wave_at(_rate(base.cycle + perturbation), _GRID) for perturbation in perturbations]
+    )
     known = wave_at(_rate(base.cycle), _GRID)[None] * len(perturbations) ** 0.5
     design = np.concatenate(
         [np.concatenate([rate, off], axis=1), np.concatenate([np.zeros_like(known), known], axis=1)]

@@ -296,7 +296,7 @@ class MotionFit:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the joints that are not constant."""
-        return tuple(one.name for one in self.series)
+        return tuple(series.name for series in self.series)
 
 
 def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
@@ -309,7 +309,7 @@ def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
     Returns:
         The fit; None where no joint moves.
     """
-    enough = [one for one in angles.values() if one.count > gait.fit.model.size + 1]
+    enough = [angle for angle in angles.values() if angle.count > gait.fit.model.size + 1]
     series = [one for one in enough if np.ptp(one.values) > 0]
     if not series:
         return None
@@ -352,13 +352,13 @@ def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tupl
             waves.append(replace(wave, plane=None if robot is None else plane))
     joints = tuple(
         JointMotion(
-            name=one.name,
-            plane=None if robot is None else planes[one.name],
+            name=series.name,
+            plane=None if robot is None else planes[series.name],
             amplitude_rad=_amplitude(motion, row),
-            offset_rad=_offset(one, moved.fit, row),
-            lag_rad=lags[one.name],
+            offset_rad=_offset(series, moved.fit, row),
+            lag_rad=lags[series.name],
         )
-        for row, one in enumerate(moved.series)
+        for row, series in enumerate(moved.series)
     )
     return FreeMotion(joints, tuple(waves)), tuple(
         name for name, one in zip(names, known, strict=True) if not one
@@ -371,11 +371,11 @@ def _amplitude(motion: Oscillation, row: int) -> Estimate:
     return Estimate(size, (max(0.0, size - half), size + half))
 
 
-def _offset(one: Series, fit: HarmonicFit, row: int) -> Estimate:
+def _offset(series: Series, fit: HarmonicFit, row: int) -> Estimate:
     """Return the mean beside the harmonics; its interval is from the scatter of whole cycles."""
     constant = float(fit.trend[row, 0])
-    left = one.values - fit.predict(row, one.t_s)
-    turns = (one.t_s - one.t_s[0]) * fit.frequency_hz
+    left = series.values - fit.predict(row, series.t_s)
+    turns = (series.t_s - series.t_s[0]) * fit.frequency_hz
     cycle = turns.astype(np.int64)
     counts, sums = np.bincount(cycle), np.bincount(cycle, weights=left)
     means = (sums[counts > 0] / counts[counts > 0])[: max(int(turns[-1]), 1)]

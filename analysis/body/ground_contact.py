@@ -169,7 +169,9 @@ def cycle_loads(
     """
 
     def averaged(series: Sequence[Series]) -> FloatArray:
-        return np.stack([means_between(one.t_s, one.values, edges_s) for one in series], axis=-1)
+        return np.stack(
+            [means_between(series.t_s, series.values, edges_s) for series in series], axis=-1
+        )
 
     vertical = averaged(up)
     vertical /= np.linalg.norm(vertical, axis=1, keepdims=True)
@@ -226,7 +228,7 @@ def _cycles(
             part = part_of(signal, start_ns, stop_ns, shared)
             one = clean(part.name, part.t_ns, part.values, span.origin_ns)
             acting.append(replace(one, values=factor * one.values))
-        bent = [one.between(edges[0], edges[-1]) for one in angles]
+        bent = [angle.between(edges[0], edges[-1]) for angle in angles]
         sampled = min(one.count for one in (*acting, *bent)) >= PHASES // 2
         # A driver without torques fills in a constant.
         if sampled and any(np.ptp(one.values) > 0 for one in acting):
@@ -272,9 +274,9 @@ def _torques(
 def _links(robot: Robot, loads: FloatArray) -> tuple[LinkContact, ...]:
     """Return the links' contact from their loads, shape (cycles, phases, links)."""
     touching = loads >= TOUCHES
-    found: list[LinkContact] = []
+    contacts: list[LinkContact] = []
     for k, link in enumerate(robot.links):
         share = mean_step(touching[..., k].mean(axis=1), 0.0, 1.0)
         by_phase = tuple(touching[..., k].mean(axis=0).tolist())
-        found.append(LinkContact(link.name, share, float(loads[..., k].mean()), by_phase))
-    return tuple(found)
+        contacts.append(LinkContact(link.name, share, float(loads[..., k].mean()), by_phase))
+    return tuple(contacts)

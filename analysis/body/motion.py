@@ -122,12 +122,12 @@ def link_centres(
         Times that all joints cover [s], shape (k,), and centres [m], shape (k, links, 3).
     """
     t_s, position, quaternion = poses
-    start = max([float(t_s[0]), *(float(one.t_s[0]) for one in angles)])
-    stop = min([float(t_s[-1]), *(float(one.t_s[-1]) for one in angles)])
+    start = max([float(t_s[0]), *(float(angle.t_s[0]) for angle in angles)])
+    stop = min([float(t_s[-1]), *(float(angle.t_s[-1]) for angle in angles)])
     inside = np.flatnonzero((t_s >= start) & (t_s <= stop))
     for first in range(0, inside.size, _CHUNK):
         rows = inside[first : first + _CHUNK]
-        shape = np.stack([one.at(t_s[rows]) for one in angles], axis=-1)
+        shape = np.stack([angle.at(t_s[rows]) for angle in angles], axis=-1)
         rotation = rotation_from_quaternion(quaternion[rows])
         yield t_s[rows], link_positions(robot, position[rows], rotation, shape)
 

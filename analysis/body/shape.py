@@ -147,7 +147,7 @@ def plane_shapes(
     size = np.abs(moved.fit.fundamental)
     power = {plane: float(np.sum(size[rows] ** 2)) for plane, rows in rows_of.items()}
     lively = _STILL**2 * max(power.values(), default=0.0)
-    found: list[PlaneShape] = []
+    shapes: list[PlaneShape] = []
     for plane, rows in rows_of.items():
         if len(rows) < LEAST_JOINTS or power[plane] <= lively:
             continue
@@ -159,8 +159,8 @@ def plane_shapes(
         serpenoid = _serpenoid(
             moved, rows, place, metres=_metres(robot, names), start_s=span.start_s, offset=offset
         )
-        found.append(PlaneShape(None if robot is None else plane, names, modes, serpenoid))
-    return tuple(found)
+        shapes.append(PlaneShape(None if robot is None else plane, names, modes, serpenoid))
+    return tuple(shapes)
 
 
 def _metres(robot: Robot | None, names: Sequence[str]) -> float | None:
@@ -207,7 +207,7 @@ def _cycles(series: Sequence[Series], span: Span) -> Iterator[FloatArray]:
     for first in range(0, span.cycles, _CYCLES):
         number = np.arange(first, min(first + _CYCLES, span.cycles))
         t_s = span.start_s + period * (number[:, None] + phase)
-        yield np.stack([one.at(t_s.ravel()).reshape(t_s.shape) for one in series], axis=-1)
+        yield np.stack([series.at(t_s.ravel()).reshape(t_s.shape) for series in series], axis=-1)
 
 
 def _share(part: FloatArray, whole: FloatArray) -> Estimate:

@@ -303,7 +303,7 @@ def gait_cycle(
     middle = path.t_s[:-1] + 0.5 * step_s
     series = [Series(name, middle, row) for name, row in zip("xyt", rates, strict=True)]
     shapes = [angles[name] for name in names]
-    slowest = max(one.period_s for one in (*shapes, series[0]))
+    slowest = max(shape.period_s for shape in (*shapes, series[0]))
     highest = int(NYQUIST_SHARE * 2 * np.pi / (slowest * omega))
     model = HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)))
     shape, velocity = (fit_at(some, omega, model) for some in (shapes, series))

@@ -340,7 +340,7 @@ class Catalog:
             return replace(file, size=_UNREAD), {"sessions": rows}, str(error)
         except (UndulogError, *_FAULTS, OSError) as error:
             facts = [LogFacts(damage=str(error))] if file.is_log else []
-            return file, {"sessions": [self._session(file, one) for one in facts]}, str(error)
+            return file, {"sessions": [self._session(file, fact) for fact in facts]}, str(error)
 
     def _session(self, file: Source, facts: LogFacts) -> Row:
         row = session_row(facts)
@@ -359,8 +359,8 @@ class Catalog:
         known = [found for found in every if found is not None]
         joints = [joint for _, own in known for joint in own]
         rows = {"analyses": [analysis for analysis, _ in known], "joints": joints}
-        for kind, own in rows.items():
-            table_of(kind, own)
+        for kind, row in rows.items():
+            table_of(kind, row)
         return rows
 
     def _result(self, file: Source) -> dict[str, list[Row]]:

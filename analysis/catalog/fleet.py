@@ -346,7 +346,7 @@ def _history(robot: str, serial: str, sessions: Frame, joints: Frame) -> RobotHi
             _change(*named, ordered) for named in points if named[2].kind is not Kind.OUTLIER
         ),
         trends=tuple(_trends(ordered)),
-        components=tuple(_components(name, one, conditions) for name, one in tables.items()),
+        components=tuple(_components(name, table, conditions) for name, table in tables.items()),
         outliers=tuple(
             _outlier(*named, ordered) for named in points if named[2].kind is Kind.OUTLIER
         ),
@@ -410,7 +410,7 @@ def _trends(sessions: Frame) -> list[Trend]:
     """Kendall's tau of each result against the date and each number that a sweep varied."""
     from scipy import stats  # takes half a second
 
-    found: list[Trend] = []
+    trends: list[Trend] = []
     for against, x in _covariates(sessions).items():
         for name in _TRENDS:
             y = sessions[name].to_numpy(float)
@@ -420,7 +420,7 @@ def _trends(sessions: Frame) -> list[Trend]:
                 continue
             tau: Any = stats.kendalltau(x[known], y[known])
             slope: Any = stats.theilslopes(y[known], x[known], alpha=0.95)
-            found.append(
+            trends.append(
                 Trend(
                     name,
                     against,
@@ -431,9 +431,9 @@ def _trends(sessions: Frame) -> list[Trend]:
                     count,
                 )
             )
-    found.sort(key=lambda trend: trend.p)
-    adjusted = holm(np.array([trend.p for trend in found])).tolist()
-    return [replace(trend, p=p) for trend, p in zip(found, adjusted, strict=True)]
+    trends.sort(key=lambda trend: trend.p)
+    adjusted = holm(np.array([trend.p for trend in trends])).tolist()
+    return [replace(trend, p=p) for trend, p in zip(trends, adjusted, strict=True)]
 
 
 def _covariates(sessions: Frame) -> dict[str, FloatArray]:

@@ -251,7 +251,7 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         "session_id": result["session"]["id"],
         "start_s": windows[0]["start_s"] if windows else None,
         "stop_s": windows[-1]["stop_s"] if windows else None,
-        "cycles": sum(one["cycles"] for one in windows) if windows else None,
+        "cycles": sum(window["cycles"] for window in windows) if windows else None,
     }
     analysis = window | {
         "answer": answer["verdict"],

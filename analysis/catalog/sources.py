@@ -107,12 +107,12 @@ def _may_be_result(path: PurePath) -> bool:
 
 
 def _local_results(base: Path) -> list[Source]:
-    found: list[Source | None] = []
+    sources: list[Source | None] = []
     for here, folders, files in walk(base):
         folders[:] = [name for name in folders if name != FOLDER]
         paths = (here / name for name in files if name.endswith(_RESULTS))
-        found += [_source(base, path) for path in paths if _may_be_result(path)]
-    return [each for each in found if each is not None]
+        sources += [_source(base, path) for path in paths if _may_be_result(path)]
+    return [each for each in sources if each is not None]
 
 
 def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
@@ -132,7 +132,7 @@ def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
 
     paths = dict.fromkeys(log_paths(base, is_recording))
     logs = (_source(base, path, is_log=True) for path in paths)
-    return [*(each for each in logs if each is not None), *others]
+    return [*(log for log in logs if log is not None), *others]
 
 
 def _is_known(source: Source, known: Mapping[str, Scanned]) -> bool:
@@ -156,7 +156,7 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
         own = [facts]
         if S_ISDIR(facts.st_mode):
             with os.scandir(at) as entries:
-                own = [each.stat() for each in entries if each.is_file()] or own
+                own = [entry.stat() for entry in entries if entry.is_file()] or own
     except FileNotFoundError:
         return None
     size, modified_ns = sum(each.st_size for each in own), max(each.st_mtime_ns for each in own)

@@ -183,13 +183,13 @@ def _table(
     as_json: bool,
 ) -> int:
     """Analyse sessions one by one and print a table, or a list of results."""
-    found: list[Analysis] = []
-    work = partial(_line, options=options, robot=robot, found=None if csv is None else found)
+    analysis: list[Analysis] = []
+    work = partial(_line, options=options, robot=robot, found=None if csv is None else analysis)
     lines = each_session(paths, "analyse", work)
     if csv is not None:
         from ..present.data_frames import write_csv
 
-        write_csv(found, csv, force=True)  # refused before the work began, if it was there
+        write_csv(analysis, csv, force=True)  # refused before the work began, if it was there
     if output is not None:
         facts = [line.facts for line in lines.values()]
         write_text(output, dumps(facts, indent=2, allow_nan=False) + "\n")

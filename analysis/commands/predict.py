@@ -77,7 +77,7 @@ def predict(
     from ..present.text import render_loop
 
     first, *others = files
-    if any(one.suffix.lower() == ".json" for one in files):
+    if any(file.suffix.lower() == ".json" for file in files):
         if others:
             raise UsageError("predict takes one result file, or the sessions of an experiment")
         coupling = coupling_of_result(first)
@@ -208,20 +208,20 @@ def _runs(
     from .analyse import chosen
 
     options = chosen(start, None, topics)
-    found: list[GaitRun] = []
+    runs: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:
             fitted = measure_session(session, options, with_dead_bands=False, with_body=False)
-            found.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
-    return tuple(found)
+            runs.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
+    return tuple(runs)
 
 
-def _notes(found: Compensation, kicked_hz: float, base: BaseGait) -> tuple[str, ...]:
+def _notes(compensation: Compensation, kicked_hz: float, base: BaseGait) -> tuple[str, ...]:
     """Say what the commands do, and where they can't."""
-    before, now = found.kicked, found.now
-    left, again = found.prediction_error, found.now != found.kicked
-    gain = (before.gain_cv.value, now.gain_cv.value, found.predicted_gain_cv)
-    lag = (before.lag_sd.value, now.lag_sd.value, found.predicted_lag_sd)
+    before, now = compensation.kicked, compensation.now
+    left, again = compensation.prediction_error, compensation.now != compensation.kicked
+    gain = (before.gain_cv.value, now.gain_cv.value, compensation.predicted_gain_cv)
+    lag = (before.lag_sd.value, now.lag_sd.value, compensation.predicted_lag_sd)
     notes = [
         f"{what}: {first} without compensation, {f'{last} by the last, ' if again else ''}{then} "
         "predicted"
@@ -231,21 +231,21 @@ def _notes(found: Compensation, kicked_hz: float, base: BaseGait) -> tuple[str, 
         )
     ]
     notes.append(
-        f"The kicks identify {found.identified:.1f} of {found.directions} directions; their errors "
-        f"leave open {_percent(left)} or {_degrees(left)} a joint"
+        f"The kicks identify {compensation.identified:.1f} of {compensation.directions} "
+        f"directions; their errors leave open {_percent(left)} or {_degrees(left)} a joint"
     )
-    if found.largest_step > 0.999 * found.step_limit:
+    if compensation.largest_step > 0.999 * compensation.step_limit:
         notes.append(
-            f"The step ends at {found.step_limit:.2g} rad or log amplitude, as far as the kicks "
-            "hold: drive it, and repeat with --after"
+            f"The step ends at {compensation.step_limit:.2g} rad or log amplitude, as far as the "
+            "kicks hold: drive it, and repeat with --after"
         )
     notes += [
-        f"{one.name} is at its {one.limited_by} limit: homogeneity would need "
-        f"{_percent(math.expm1(one.lacking))} more amplitude"
-        for one in found.joints
-        if one.lacking > 0
+        f"{joint.name} is at its {joint.limited_by} limit: homogeneity would need "
+        f"{_percent(math.expm1(joint.lacking))} more amplitude"
+        for joint in compensation.joints
+        if joint.lacking > 0
     ]
-    known = [one for one in found.joints if one.margin is not None]
+    known = [joint for joint in compensation.joints if joint.margin is not None]
     if known:
         least = min(known, key=lambda one: one.margin or 0.0)
         notes.append(

@@ -319,15 +319,15 @@ def _fleet(where: str, find: str, output: Path) -> _Page:
     from ..catalog.fleet import analyse_fleet
     from ..present.page import render_fleet
 
-    found = Catalog(where)
+    catalog = Catalog(where)
     with progress("report", total=2) as bar:
-        found.scan()
-        missing = found.find(find).query("status == 'not analysed' and damage.isna()")["path"]
-        faults = found.analyse(
+        catalog.scan()
+        missing = catalog.find(find).query("status == 'not analysed' and damage.isna()")["path"]
+        faults = catalog.analyse(
             missing.to_list(), on_done=lambda k, n: bar.update(k / n, f"{k} of {n} analysed")
         )
         bar.update(1, note="page")
-        sessions, joints = found.find(find), found.find(joints=True)
+        sessions, joints = catalog.find(find), catalog.find(joints=True)
         fleet = analyse_fleet(sessions, joints)
         warnings = [*fleet.warnings, *(f"{name}: {why}" for name, why in faults.items())]
         fleet = replace(fleet, warnings=tuple(warnings))
@@ -371,7 +371,7 @@ def _several(files: Sequence[Path], options: Options, robot: str | None) -> _Pag
     page = render(experiment)
     facts = {
         "answer": f"{len(files)} sessions: {experiment.answer}.",
-        "answers": [_summary(one) for one in experiment.sessions],
+        "answers": [_summary(session) for session in experiment.sessions],
     }
     return _Page(page, facts, len(experiment.warnings))
 

@@ -51,26 +51,30 @@ def broken_joints(
     Returns:
         The joints in the order of the answers, those that do not follow first.
     """
-    found: list[BrokenJoint] = []
+    joints: list[BrokenJoint] = []
     for side, own, other in (("B", b, a), ("A", a, b)):
         answers = [one.analysis.answer for one in own]
         elsewhere = {each.joint for one in other for each in one.analysis.answer.not_following}
         for fault in _first([each for answer in answers for each in answer.not_following]):
             if fault.joint not in elsewhere:
                 text = f"in {side} {fault_in_words(fault)}"
-                found.append(BrokenJoint(fault.joint, side, fault.kinds, text))
-        known = {each.name for each in found}
+                joints.append(BrokenJoint(fault.joint, side, fault.kinds, text))
+        known = {each.name for each in joints}
         stand_out = [each for answer in answers for each in answer.stand_out]
         for each in _first([each for each in stand_out if each.quantity == "offset"]):
             if each.joint not in known | elsewhere and _moved(each.joint, own, other):
                 text = f"in {side} {plain(each.joint)} has {deviation_in_words(each)}"
-                found.append(BrokenJoint(each.joint, side, (), text))
-    return tuple(sorted(found, key=lambda each: not each.kinds))
+                joints.append(BrokenJoint(each.joint, side, (), text))
+    return tuple(sorted(joints, key=lambda each: not each.kinds))
 
 
-def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
+def _moved(
+    joint: str, sessions: Sequence[ComparedSession], other: Sequence[ComparedSession]
+) -> bool:
     """Return whether a joint's mean differs between the sides, too: both may share a zero."""
-    sides = [[one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)]
+    sides = [
+        [one.offsets[joint] for one in side if joint in one.offsets] for side in (sessions, other)
+    ]
     if not all(sides):
         return True
     here, there = (float(np.median(side)) for side in sides)
@@ -82,10 +86,10 @@ _Entry = TypeVar("_Entry", NotFollowing, StandOut)
 
 def _first(several: Sequence[_Entry]) -> list[_Entry]:
     """Return the first entry of each joint."""
-    found: dict[str, _Entry] = {}
+    entries: dict[str, _Entry] = {}
     for each in several:
-        found.setdefault(each.joint, each)
-    return list(found.values())
+        entries.setdefault(each.joint, each)
+    return list(entries.values())
 
 
 @dataclass(frozen=True)
@@ -331,9 +335,13 @@ def compare_fitted(
     )
     partial = _partial(aligned, " by their phase" if free else "")
     _warn(a, b, design, every_warning.append)
-    moved = {one.place for one in moved_offsets(decided)}
+    moved = {moved_offset.place for moved_offset in moved_offsets(decided)}
     # What stands off on one side is stated by the difference, which has an interval.
-    broken = tuple(one for one in broken_joints(a, b) if one.kinds or one.name not in moved)
+    broken = tuple(
+        broken_joint
+        for broken_joint in broken_joints(a, b)
+        if broken_joint.kinds or broken_joint.name not in moved
+    )
     alike = one_robot([one.facts for one in (*a, *b)]) and aligned.commands_differ is None
     verb = MOVED if alike and aligned.gaits_differ is None else DIFFERS
     verdict, sentence = answer_of(decided, partial is not None, broken, verb)
@@ -440,16 +448,16 @@ def _warn(
     if design == "groups" and max(len(a), len(b)) < 4:
         warn(f"{len(a)} and {len(b)} runs: so few leave wide intervals; 6 a side are a good number")
     for side, sessions in (("A", a), ("B", b)):
-        for one in sessions:
-            for text in one.analysis.warnings:
+        for session in sessions:
+            for text in session.analysis.warnings:
                 if text.startswith("not settled"):
-                    warn(f"{side}, {one.run.label}: {text}")
+                    warn(f"{side}, {session.run.label}: {text}")
 
 
 def _waveforms(
     a: Sequence[ComparedSession], b: Sequence[ComparedSession], names: Sequence[str], design: str
 ) -> tuple[Waveform, ...]:
-    found: list[Waveform] = []
+    waveforms: list[Waveform] = []
     for name in names:
         if not all(name in one.cycles for one in (*a, *b)):
             continue
@@ -458,7 +466,7 @@ def _waveforms(
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
         most = float(difference.value[worst])
-        found.append(
+        waveforms.append(
             Waveform(
                 name=name,
                 a_rad=tuple(first.value.tolist()),
@@ -470,20 +478,20 @@ def _waveforms(
                 largest_at_rad=float(phases_rad()[worst]),
             )
         )
-    return tuple(found)
+    return tuple(waveforms)
 
 
-def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
+def _by_first(session: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
     """Turn a mean cycle to the phase of the first common joint of the same frequency."""
-    if (motion := one.motion) is not None:
+    if (motion := session.motion) is not None:
         return turned(
-            one.cycles[name], motion.phase_rad(motion.names[0]) - motion.phase_rad(names[0])
+            session.cycles[name], motion.phase_rad(motion.names[0]) - motion.phase_rad(names[0])
         )
-    run = one.run
+    run = session.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]
     commands = run.command[[members[0], next(k for k in members if run.names[k] in names)]]
-    return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
+    return turned(session.cycles[name], float(np.angle(commands[0] / commands[1])))
 
 
 def _provenance(

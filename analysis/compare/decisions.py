@@ -128,7 +128,7 @@ def differ(
     if design == "sessions":
         return a[0], b[0], independent(a[0], b[0])
     runs = [np.stack([one.value for one in side]) for side in (a, b)]
-    first, second = (from_runs(one) for one in runs)
+    first, second = (from_runs(run) for run in runs)
     return first, second, paired(*runs) if design == "pairs" else independent(first, second)
 
 
@@ -152,7 +152,7 @@ def decide(
     keys: Sequence[Key],
     a: Quantities,
     b: Quantities,
-    found: Differences,
+    differences: Differences,
     margins: Margins,
     *,
     before: Mapping[str, str] | None = None,
@@ -166,14 +166,14 @@ def decide(
         before: The joint that each joint's phase lag is taken to.
         rate_rad_s: Rate of the fastest command whose lag is in seconds [rad/s].
     """
-    p, adjusted, half = found.p, holm(found.p), found.half
+    p, adjusted, half = differences.p, holm(differences.p), differences.half
     kinds = np.array([quantity for quantity, _ in keys])
     margin = _margins(kinds, a.value, margins, rate_rad_s)
-    size = np.abs(found.value) / margin
+    size = np.abs(differences.value) / margin
     decisions: list[Difference] = []
     for k, (quantity, place) in enumerate(keys):
         log = quantity in _BY_RATIO
-        ends = around(float(found.value[k]), float(half[k]))
+        ends = around(float(differences.value[k]), float(half[k]))
         decisions.append(
             Difference(
                 quantity=quantity,
@@ -182,7 +182,7 @@ def decide(
                 a=_plain(a.value[k], log=log),
                 b=_plain(b.value[k], log=log),
                 difference=Estimate(
-                    float(np.expm1(found.value[k]) if log else found.value[k]),
+                    float(np.expm1(differences.value[k]) if log else differences.value[k]),
                     (float(np.expm1(ends[0])), float(np.expm1(ends[1]))) if log else ends,
                 ),
                 p=float(p[k]),
@@ -192,12 +192,12 @@ def decide(
         )
     decisions.sort(key=_rank)
     named = _named(decisions, before or {})
-    return Decided(tuple(decisions), named, _equivalence(kinds, found, margin))
+    return Decided(tuple(decisions), named, _equivalence(kinds, differences, margin))
 
 
-def _rank(one: Difference) -> tuple[bool, float]:
-    beyond_doubt = one.p_holm < SIGNIFICANT_DIFFERENCE
-    return (not beyond_doubt, -one.size if beyond_doubt else one.p)
+def _rank(difference: Difference) -> tuple[bool, float]:
+    beyond_doubt = difference.p_holm < SIGNIFICANT_DIFFERENCE
+    return (not beyond_doubt, -difference.size if beyond_doubt else difference.p)
 
 
 def _plain(value: float, *, log: bool) -> float:
@@ -221,9 +221,11 @@ def _named(decisions: Sequence[Difference], before: Mapping[str, str]) -> tuple[
     """List the joints that differ, the largest first: a weak module changes its neighbours less."""
     parts: dict[str, list[Difference]] = {}
     follows = _follow(decisions, before)
-    for one in decisions:
-        if one.quantity in RESPONSE and (one.quantity != "phase_lag" or one.place not in follows):
-            parts.setdefault(one.place, []).append(one)
+    for decision in decisions:
+        if decision.quantity in RESPONSE and (
+            decision.quantity != "phase_lag" or decision.place not in follows
+        ):
+            parts.setdefault(decision.place, []).append(decision)
     named = [
         NamedJoint(name, float(np.hypot.reduce([one.size for one in both])), least)
         for name, both in parts.items()
@@ -238,9 +240,9 @@ def _follow(decisions: Sequence[Difference], before: Mapping[str, str]) -> set[s
     A joint that is late by itself adds to its own lag what it takes off that of the next one.
     """
     lags = {
-        one.place: one.difference.value or 0.0
-        for one in decisions
-        if one.quantity == "phase_lag" and one.p_holm < SIGNIFICANT_DIFFERENCE
+        decision.place: decision.difference.value or 0.0
+        for decision in decisions
+        if decision.quantity == "phase_lag" and decision.p_holm < SIGNIFICANT_DIFFERENCE
     }
     found: set[str] = set()
     for joint, last in before.items():  # in chain order
@@ -252,13 +254,13 @@ def _follow(decisions: Sequence[Difference], before: Mapping[str, str]) -> set[s
 
 
 def _equivalence(
-    kinds: np.ndarray, found: Differences, margin: FloatArray
+    kinds: np.ndarray, differences: Differences, margin: FloatArray
 ) -> tuple[Equivalence, ...]:
     results: list[Equivalence] = []
     for kind in dict.fromkeys(kinds.tolist()):
         one = kinds == kind
-        value, within = found.value[one], float(margin[one][0])
-        p = equivalence_p(value, found.error[one], found.dof[one], within)
+        value, within = differences.value[one], float(margin[one][0])
+        p = equivalence_p(value, differences.error[one], differences.dof[one], within)
         unit = "1" if kind in _BY_RATIO else UNITS[kind]
         results.append(Equivalence(kind, within, unit, float(np.abs(value).max()), p))
     return tuple(results)
@@ -293,7 +295,9 @@ def answer_of(
     of_joints = [one for one in main if one.quantity != "frequency"]
     margins = _listed(margin_text(one) for one in of_joints)
     whole = " (partial comparison)" if partial else ""
-    joints = len({one.place for one in decided.differences if not of_body(one.place)})
+    joints = len(
+        {difference.place for difference in decided.differences if not of_body(difference.place)}
+    )
     which = "the joint" if joints == 1 else f"all {joints} joints"
     words = _listed(dict.fromkeys(WORDS[one.quantity] for one in of_joints))
     are = "are" if len(of_joints) > 1 else "is"
@@ -315,9 +319,10 @@ def answer_of(
 def _beyond_doubt(decided: Decided) -> list[Difference]:
     """Return differences that are significant and whose interval leaves out zero."""
     return [
-        one
-        for one in decided.differences
-        if one.p_holm < SIGNIFICANT_DIFFERENCE and leaves_out_zero(one.difference.ci95)
+        difference
+        for difference in decided.differences
+        if difference.p_holm < SIGNIFICANT_DIFFERENCE
+        and leaves_out_zero(difference.difference.ci95)
     ]
 
 
@@ -360,18 +365,20 @@ def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
     names = {each.name for each in broken}
     return dataclasses.replace(
         decided,
-        differences=tuple(one for one in decided.differences if one.place not in names),
+        differences=tuple(
+            difference for difference in decided.differences if difference.place not in names
+        ),
         named=tuple(one for one in decided.named if one.name not in names),
     )
 
 
-def difference_text(one: Difference) -> str:
+def difference_text(difference: Difference) -> str:
     """Format a difference with its interval.
 
     Returns:
         For example ``gain −8.1 % [−8.6, −7.6]``.
     """
-    return f"{WORDS[one.quantity]} {signed_difference(one)}"
+    return f"{WORDS[difference.quantity]} {signed_difference(difference)}"
 
 
 def people_unit(unit: str) -> tuple[float, str]:
@@ -385,33 +392,33 @@ def people_unit(unit: str) -> tuple[float, str]:
     return units.get(unit, (1.0, f" {unit}"))
 
 
-def in_people_units(one: Difference) -> tuple[Estimate, str]:
+def in_people_units(difference: Difference) -> tuple[Estimate, str]:
     """Convert a difference to percent or degrees.
 
     Returns:
         Percent for gains, amplitudes and frequencies, degrees for lags (of wave numbers a joint),
         the travelling index as it is, and for the others percent of side A.
     """
-    if one.quantity in _BY_RATIO:
-        return formats.scaled(one.difference, 100.0), " %"
-    factor, unit = people_unit(one.unit)
+    if difference.quantity in _BY_RATIO:
+        return formats.scaled(difference.difference, 100.0), " %"
+    factor, unit = people_unit(difference.unit)
     if factor != 1:
-        return formats.scaled(one.difference, factor), unit
-    if one.quantity == "travelling_index":
-        return one.difference, ""
-    if one.a > 0:
-        return formats.scaled(one.difference, 100.0 / one.a), " %"
-    return one.difference, f" {one.unit}"
+        return formats.scaled(difference.difference, factor), unit
+    if difference.quantity == "travelling_index":
+        return difference.difference, ""
+    if difference.a > 0:
+        return formats.scaled(difference.difference, 100.0 / difference.a), " %"
+    return difference.difference, f" {difference.unit}"
 
 
-def decimals_of(one: Difference) -> int:
+def decimals_of(difference: Difference) -> int:
     """Return the most decimals that a difference is shown with."""
-    return 4 if one.quantity in ("frequency", "travelling_index") else 2
+    return 4 if difference.quantity in ("frequency", "travelling_index") else 2
 
 
-def signed_difference(one: Difference) -> str:
+def signed_difference(difference: Difference) -> str:
     """Format a difference in readable units with its sign."""
-    return signed(*in_people_units(one), most=decimals_of(one))
+    return signed(*in_people_units(difference), most=decimals_of(difference))
 
 
 def signed(quantity: Estimate, unit: str, most: int = 2) -> str:
@@ -462,21 +469,21 @@ def _not_shown(decided: Decided, tests: Sequence[Equivalence]) -> str:
         if test.quantity not in RESPONSE and test.p < SIGNIFICANT_DIFFERENCE:
             continue
         worst = 0.0
-        for one in decided.differences:
-            ends = one.difference.ci95
-            if one.quantity == test.quantity and ends is not None:
+        for difference in decided.differences:
+            ends = difference.difference.ci95
+            if difference.quantity == test.quantity and ends is not None:
                 worst = max(worst, abs(ends[0]), abs(ends[1]))
         shown.append(f"{margin_text(test, worst)} in {WORDS[test.quantity]}")
     return f"up to {' and '.join(shown)} could hide in the noise; record more"
 
 
-def margin_text(one: Equivalence, value: float | None = None) -> str:
+def margin_text(equivalence: Equivalence, value: float | None = None) -> str:
     """Return a difference in readable units, e.g. ``2 %``, ``0.35°`` or ``0.01 J``.
 
     Args:
         value: In the test's unit; its margin if None.
     """
-    factor, unit = people_unit(one.unit)
-    if one.quantity in _BY_RATIO:
+    factor, unit = people_unit(equivalence.unit)
+    if equivalence.quantity in _BY_RATIO:
         factor, unit = 100.0, " %"
-    return f"{(one.margin if value is None else value) * factor:.2g}{unit}"
+    return f"{(equivalence.margin if value is None else value) * factor:.2g}{unit}"

@@ -224,23 +224,25 @@ def common_motion(motions: Sequence[Motion]) -> CommonMotion:
         DataError: If no joint moves in all of them.
     """
     # Joints of the first session, then others, which no other session can shift.
-    recorded = [frozenset(one.chain) for one in motions]
-    phased = [one.phased for one in motions]
-    joints = list(dict.fromkeys(name for one in motions for name in one.chain))
+    recorded = [frozenset(motion.chain) for motion in motions]
+    phased = [motion.phased for motion in motions]
+    joints = list(dict.fromkeys(name for motion in motions for name in motion.chain))
     names = tuple(name for name in joints if all(name in known for known in phased))
     if not names:
         raise DataError(
             "no joint moves at the common frequency in all sessions, so nothing can be compared: "
-            + "; ".join(f"in {one.label} {_some(one)}" for one in motions)
+            + "; ".join(f"in {motion.label} {_some(motion)}" for motion in motions)
         )
     left_out: dict[str, str] = {}
     for name in joints:
         unknown = [
-            one.label for one, known in zip(motions, recorded, strict=True) if name not in known
+            motion.label
+            for motion, known in zip(motions, recorded, strict=True)
+            if name not in known
         ]
         at_rest = [
-            one.label
-            for one, known, moves in zip(motions, recorded, phased, strict=True)
+            motion.label
+            for motion, known, moves in zip(motions, recorded, phased, strict=True)
             if name in known and name not in moves
         ]
         if len(at_rest) == len(motions):
@@ -249,7 +251,7 @@ def common_motion(motions: Sequence[Motion]) -> CommonMotion:
         parts += [f"no phase in {', '.join(at_rest)}"] if at_rest else []
         if parts:
             left_out[name] = ", ".join(parts)
-    robot = next((one.robot for one in motions if one.robot is not None), None)
+    robot = next((motion.robot for motion in motions if motion.robot is not None), None)
     planes: dict[str, tuple[tuple[str, ...], FloatArray]] = {}
     phases: dict[str, FloatArray] = {}
     before: dict[str, str] = {}

@@ -63,7 +63,13 @@ def phases_rad() -> FloatArray:
 
 
 def cycles_by_phase(
-    one: Series, fit: HarmonicFit, channel: int, *, zero_rad: float, start_s: float, stop_s: float
+    series: Series,
+    fit: HarmonicFit,
+    channel: int,
+    *,
+    zero_rad: float,
+    start_s: float,
+    stop_s: float,
 ) -> FloatArray:
     """Cut a response into its whole cycles.
 
@@ -85,17 +91,17 @@ def cycles_by_phase(
     first += np.ceil((start_s - first) / cycle_s - 1e-6) * cycle_s
     starts = first + cycle_s * np.arange(max(0, int(np.floor((stop_s - first) / cycle_s + 1e-6))))
     times = starts[:, None] + cycle_s * np.arange(PHASES) / PHASES
-    rest = one.values - fit.predict(channel, one.t_s)
-    left = Series(one.name, one.t_s, rest).at(times.ravel()).reshape(times.shape)
+    rest = series.values - fit.predict(channel, series.t_s)
+    left = Series(series.name, series.t_s, rest).at(times.ravel()).reshape(times.shape)
     cut = fit.predict(channel, times) + left
-    return cut[_whole(one, starts, starts + cycle_s)]
+    return cut[_whole(series, starts, starts + cycle_s)]
 
 
-def _whole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> BoolArray:
+def _whole(series: Series, start_s: FloatArray, stop_s: FloatArray) -> BoolArray:
     """Return which of c cycles samples cover without a gap, shape (c,)."""
-    first, last = one.rows_from(start_s), one.rows_from(stop_s) - 1
+    first, last = series.rows_from(start_s), series.rows_from(stop_s) - 1
     whole = last > first
-    i, j, t_s, longest = first[whole], last[whole], one.t_s, GAP_FACTOR * one.period_s
+    i, j, t_s, longest = first[whole], last[whole], series.t_s, GAP_FACTOR * series.period_s
     gaps = np.append(0, np.cumsum(np.diff(t_s) > longest))  # before each sample
     whole[whole] = (
         (t_s[i] - start_s[whole] <= longest)
@@ -134,7 +140,7 @@ def one_robot(facts: Sequence[Mapping[str, str]]) -> bool:
         facts: Of each session.
     """
     keys = ("robot", "session: serial")
-    return all(len({one[key] for one in facts if one.get(key)}) <= 1 for key in keys)
+    return all(len({fact[key] for fact in facts if fact.get(key)}) <= 1 for key in keys)
 
 
 def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
@@ -169,15 +175,15 @@ def _flat(value: Any, before: str = "") -> dict[str, str]:
         table = cast("dict[str, Any]", value)
         parts = {f"{before}.{key}" if before else key: one for key, one in table.items()}
     elif isinstance(value, list):
-        for k, one in enumerate(cast("list[Any]", value)):
-            if isinstance(one, dict):
-                name = cast("dict[str, Any]", one).get("name", k)
-                parts[f"{before}[{name}]"] = one
+        for k, part in enumerate(cast("list[Any]", value)):
+            if isinstance(part, dict):
+                name = cast("dict[str, Any]", part).get("name", k)
+                parts[f"{before}[{name}]"] = part
     if not parts:
         return {} if value == {} else {before: _text(value)}
     flat: dict[str, str] = {}
-    for key, one in parts.items():
-        flat |= _flat(one, key)
+    for key, part in parts.items():
+        flat |= _flat(part, key)
     return flat
 
 
@@ -246,7 +252,9 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
                 warn(f"no {quantity.replace('_', ' ')}: it hardly gets anywhere")
             else:
                 estimates[quantity, BODY] = known
-    offsets = {name: float(np.median(each)) for name, each in measured.offsets.items() if each.size}
+    offsets = {
+        name: float(np.median(offset)) for name, offset in measured.offsets.items() if offset.size
+    }
     moved = measured.motion
     motion = None if moved is None else motion_of(run.label, session.robot, moved)
     cycles = _cycles(measured, run) if moved is None else _cycles_of_motion(moved, measured.span)
@@ -305,28 +313,28 @@ def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
 
 def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]:
     gait, span = measured.gait, measured.span
-    found: dict[str, Quantities] = {}
+    quantities: dict[str, Quantities] = {}
     if gait is None or not run.names:
-        return found
+        return quantities
     for group, members in zip(gait.groups, run.by_group, strict=True):
         for k, name in enumerate(group.answered):
             at, first = len(group.driven) + k, complex(run.command[members[0]])
-            found |= _mean_cycle(measured.responses[name], group.fit, at, first, span)
-    return found
+            quantities |= _mean_cycle(measured.responses[name], group.fit, at, first, span)
+    return quantities
 
 
 def _cycles_of_motion(moved: MotionFit, span: Span) -> dict[str, Quantities]:
-    found: dict[str, Quantities] = {}
-    for row, one in enumerate(moved.series):
-        found |= _mean_cycle(one, moved.fit, row, complex(moved.fit.fundamental[0]), span)
-    return found
+    quantities: dict[str, Quantities] = {}
+    for row, series in enumerate(moved.series):
+        quantities |= _mean_cycle(series, moved.fit, row, complex(moved.fit.fundamental[0]), span)
+    return quantities
 
 
 def _mean_cycle(
-    one: Series, fit: HarmonicFit, channel: int, reference: complex, span: Span
+    series: Series, fit: HarmonicFit, channel: int, reference: complex, span: Span
 ) -> dict[str, Quantities]:
     """Return the mean cycle by the phase of a reference, by name; empty without two cycles."""
     zero_rad = float(np.angle(reference))
     window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
-    cut = cycles_by_phase(one, fit, channel, **window)
-    return {one.name: from_runs(cut)} if len(cut) > 1 else {}
+    cut = cycles_by_phase(series, fit, channel, **window)
+    return {series.name: from_runs(cut)} if len(cut) > 1 else {}

@@ -72,8 +72,8 @@ def at_one_command(
     """
     common: dict[str, float] = {}
     apart: set[str] = set()
-    for name in dict.fromkeys(name for known in commands for name in known):
-        own = [known[name] for known in commands if name in known]
+    for name in dict.fromkeys(name for command in commands for name in command):
+        own = [command[name] for command in commands if name in command]
         means = np.array([command.mean_rad for command in own])
         common[name] = float(means.mean())
         if np.ptp(means) >= ANGLE_MARGIN_RAD and any(command.slope is None for command in own):
@@ -83,10 +83,10 @@ def at_one_command(
             key: _at(one, of_session.get(key[1]), common.get(key[1], 0.0))
             if key[0] == "offset"
             else one
-            for key, one in known.items()
+            for key, one in estimate.items()
             if key[0] != "offset" or key[1] not in apart
         }
-        for known, of_session in zip(estimates, commands, strict=True)
+        for estimate, of_session in zip(estimates, commands, strict=True)
     ]
 
 

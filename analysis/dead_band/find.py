@@ -218,14 +218,14 @@ def dead_bands(
         return {}
     names = [name for name in gait.answered if name in commands and name in responses]
     measured = [responses[name] for name in names]
-    found: dict[str, DeadBand] = {}
+    bands: dict[str, DeadBand] = {}
     for group in shared_times(measured):
         own = [names[i] for i in group]
         both = [commands[name] for name in own], [responses[name] for name in own]
         cycles = whole_cycles(*both, gait.fit.omega, MOST_CYCLES)
         if cycles is not None:
-            found |= _of_group(own, cycles, gait.fit.omega, columns, origin_ns)
-    return found
+            bands |= _of_group(own, cycles, gait.fit.omega, columns, origin_ns)
+    return bands
 
 
 def _of_group(
@@ -247,7 +247,7 @@ def _of_group(
     some = tuple(cycles.commands[j] for j in chosen)
     part = Cycles(some, cycles.t_s, cycles.first, cycles.measured[chosen])
     fits = fit_dead_bands(part, omega, amplitude[chosen], lag[chosen], resolution[chosen])
-    found: dict[str, DeadBand] = {}
+    bands: dict[str, DeadBand] = {}
     for k, (j, one) in enumerate(zip(chosen.tolist(), fits, strict=True)):
         least = RESOLVED * resolution[j] / abs(one.gain) if one.gain else np.inf
         clearer = one.independent * np.log(linear[j, 0] / one.cost)
@@ -257,10 +257,10 @@ def _of_group(
         rest_s = _rests(part, k, one, float(resolution[j]))
         if rest_s is not None:
             kind = decide(part, k, one, Witness.of(columns, names[j], origin_ns))
-            found[names[j]] = _result(
+            bands[names[j]] = _result(
                 one, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
             )
-    return found
+    return bands
 
 
 def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
@@ -309,18 +309,18 @@ def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[floa
 
 
 def _rests(
-    cycles: Cycles, joint: int, one: Fitted, resolution: float
+    cycles: Cycles, joint: int, fitted: Fitted, resolution: float
 ) -> tuple[float, float] | None:
     """For how long the joint rests after top and bottom [s]; None unless it does at both."""
     begin = cycles.first // 2  # by then the model has its state
-    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, begin:]
-    middle = float(one.follower.mean())
+    command = cycles.commanded(joint, float(fitted.parameters[DELAY]))[:, begin:]
+    middle = float(fitted.follower.mean())
     found: tuple[list[float], list[float]] = ([], [])
     crept: tuple[list[float], list[float]] = ([], [])
     led: tuple[list[float], list[float]] = ([], [])
     for rests, z, c, seen in zip(
-        one.rests[:, begin:],
-        one.follower[:, begin:],
+        fitted.rests[:, begin:],
+        fitted.follower[:, begin:],
         command,
         cycles.measured[joint, :, begin:],
         strict=True,
@@ -334,7 +334,7 @@ def _rests(
             parts = np.array_split(seen[settled], 3 if k - i >= _LONG else 2)
             means = [float(part.mean()) for part in parts]
             crept[side].append(max(means) - min(means))
-            led[side].append(abs(one.gain) * float(np.ptp(c[settled])))
+            led[side].append(abs(fitted.gain) * float(np.ptp(c[settled])))
     for side in (0, 1):
         if not found[side]:
             return None
@@ -345,7 +345,7 @@ def _rests(
 
 
 def _result(
-    one: Fitted,
+    fitted: Fitted,
     command: Series,
     rest_s: tuple[float, float],
     omega: float,
@@ -353,18 +353,18 @@ def _result(
     kind: tuple[str, str],
     count: int,
 ) -> DeadBand:
-    width, top, bottom = one.parameters[[WIDTH, TOP, BOTTOM]].tolist()
+    width, top, bottom = fitted.parameters[[WIDTH, TOP, BOTTOM]].tolist()
     followed = rested(command.values, width, top, bottom)
     change = fundamental_change(command.t_s, command.values, followed, omega)
     sides = [
         Reversal(
             travel_rad=float(travel[0]),
             travel_ci95=(float(travel[1]), float(travel[2])),
-            step_rad=one.gain * float(step[0]),
-            step_ci95=(one.gain * float(step[1]), one.gain * float(step[2])),
+            step_rad=fitted.gain * float(step[0]),
+            step_ci95=(fitted.gain * float(step[1]), fitted.gain * float(step[2])),
             rest_s=lasts,
         )
-        for travel, step, lasts in zip(one.travel, one.step, rest_s, strict=True)
+        for travel, step, lasts in zip(fitted.travel, fitted.step, rest_s, strict=True)
     ]
     return DeadBand(
         kind=kind[0],

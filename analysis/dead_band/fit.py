@@ -145,7 +145,7 @@ class _Candidates(NamedTuple):
 def _chosen(
     cycles: Cycles,
     joint: int,
-    found: _Candidates,
+    candidates: _Candidates,
     scales: _Scales,
     *,
     lefts: Sequence[Misfit],
@@ -158,24 +158,26 @@ def _chosen(
         moved: Of the first fit, see :func:`_moved`.
     """
     independent = _independent(lefts[-1].residual[0])
-    least = min(float(found.costs.min()), *(float(left.cost[0]) for left in lefts))
+    least = min(float(candidates.costs.min()), *(float(left.cost[0]) for left in lefts))
     taken = 0
-    error = _errors(cycles, joint, found.fits[0], scales, lefts[0], nudged=moved)
+    error = _errors(cycles, joint, candidates.fits[0], scales, lefts[0], nudged=moved)
     for k, needed in zip((1, 2), _NEEDED, strict=True):
         gained = independent * np.log(lefts[taken].cost[0] / lefts[k].cost[0])
         # Ahead of its command no joint is: it would speed up by its inertia, which isn't a step.
-        if gained > needed and found.fits[k].parameters[DELAY] >= _AHEAD * cycles.period_s:
-            (more,) = _moved(cycles, [joint], [found.fits[k]], scales)
-            wider = _errors(cycles, joint, found.fits[k], scales, lefts[k], nudged=more)
-            if np.any(found.fits[k].parameters[[TOP, BOTTOM]] > wider[2:]):
+        if gained > needed and candidates.fits[k].parameters[DELAY] >= _AHEAD * cycles.period_s:
+            (more,) = _moved(cycles, [joint], [candidates.fits[k]], scales)
+            wider = _errors(cycles, joint, candidates.fits[k], scales, lefts[k], nudged=more)
+            if np.any(candidates.fits[k].parameters[[TOP, BOTTOM]] > wider[2:]):
                 taken, error = k, wider
-    chosen, left = found.fits[taken].parameters, lefts[taken]
+    chosen, left = candidates.fits[taken].parameters, lefts[taken]
     travel = np.stack([chosen[WIDTH] + chosen[[TOP, BOTTOM]]] * 3, axis=1)
     step = np.stack([chosen[[TOP, BOTTOM]]] * 3, axis=1)
     travel[:, 1:] += np.outer(error[:2], [-1, 1])
     step[:, 1:] += np.outer(error[2:], [-1, 1])
     if taken < len(_NEEDED):
-        low, high, most = _possible(found.profile, independent * np.log(found.costs / least))
+        low, high, most = _possible(
+            candidates.profile, independent * np.log(candidates.costs / least)
+        )
         travel[:, 1] = np.minimum(travel[:, 1], low - error[:2])
         travel[:, 2] = np.maximum(travel[:, 2], high + error[:2])
         step[:, 2] = np.maximum(step[:, 2], most)
@@ -344,10 +346,10 @@ def _moved(
     cycles: Cycles, joints: Sequence[int], fits: Sequence[_Candidate], scales: _Scales
 ) -> list[FloatArray]:
     """Return the followers of each joint with each of its free parameters nudged [rad]."""
-    free = [_free(one, scales) for one in fits]
+    free = [_free(fit, scales) for fit in fits]
     sets = [
-        one.parameters + one.tie[:, which].T * scales.nudge[joint, which, np.newaxis]
-        for joint, one, which in zip(joints, fits, free, strict=True)
+        fit.parameters + fit.tie[:, which].T * scales.nudge[joint, which, np.newaxis]
+        for joint, fit, which in zip(joints, fits, free, strict=True)
     ]
     counts = [which.size for which in free]
     if not any(counts):

@@ -182,7 +182,7 @@ def whole_cycles(
         return None
     stride = -(-count // _MOST_SAMPLES)
     index = starts[:, np.newaxis] + np.arange(0, first + count, stride)
-    measured = np.stack([one.values[index] for one in responses])
+    measured = np.stack([response.values[index] for response in responses])
     return Cycles(tuple(commands), t_s[index], -(-first // stride), measured)
 
 

@@ -284,7 +284,7 @@ def cycles_of(
     if known.size >= MIN_DIFFERENCES:
         variance = np.divide(known.mean() / 2, answer, out=variance, where=answer > 0)
         dof = _difference_dof(known.size)
-    starts, stops = ([one[:-1] for one in edges], [one[1:] for one in edges])
+    starts, stops = ([edge[:-1] for edge in edges], [edge[1:] for edge in edges])
     return Cycles(np.concatenate(starts), np.concatenate(stops), ratio, variance, dof)
 
 
@@ -298,12 +298,14 @@ def _difference_dof(count: int) -> float:
     return 2 * (6.0 * count) ** 2 / variance
 
 
-def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[ComplexArray, FloatArray]:
+def _amplitudes(
+    series: Series, phase: Phase, edges_s: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
     """Return the fundamental in each cycle, and its power as a share of all; each (c,)."""
     count = edges_s.size - 1
     amplitude = np.full(count, np.nan, dtype=np.complex128)
     explained = np.zeros(count)
-    part = one.between(float(phase.t_s[0]), float(phase.t_s[-1]))
+    part = series.between(float(phase.t_s[0]), float(phase.t_s[-1]))
     if part.count < MIN_SAMPLES:
         return amplitude, explained
     turned = phase.at(part.t_s)
@@ -377,12 +379,12 @@ def _comb(phase: FloatArray, values: FloatArray) -> FloatArray:
     return np.where(inside, mean, np.nan)
 
 
-def _holes(one: Series, edges_s: FloatArray) -> BoolArray:
+def _holes(series: Series, edges_s: FloatArray) -> BoolArray:
     """Cycles that a gap reaches into, or that begin or end outside the samples; shape (c,)."""
-    begun = np.searchsorted(one.t_s[one.gaps + 1], edges_s[:-1], "right")
-    ended = np.searchsorted(one.t_s[one.gaps], edges_s[1:], "left")
-    early, late = one.t_s[0] - edges_s[:-1], edges_s[1:] - one.t_s[-1]
+    begun = np.searchsorted(series.t_s[series.gaps + 1], edges_s[:-1], "right")
+    ended = np.searchsorted(series.t_s[series.gaps], edges_s[1:], "left")
+    early, late = series.t_s[0] - edges_s[:-1], edges_s[1:] - series.t_s[-1]
     outside: BoolArray = np.maximum(early, late) > 0
     if np.any(outside):
-        outside = np.maximum(early, late) > one.period_s
+        outside = np.maximum(early, late) > series.period_s
     return (begun < ended) | outside

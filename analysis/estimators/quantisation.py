@@ -138,7 +138,7 @@ def steady_noise(step: float, residual: float, level: float) -> float | None:
 
 
 def rounding_covariance(
-    one: Series, fit: HarmonicFit, channel: int, step: float, noise: float
+    series: Series, fit: HarmonicFit, channel: int, step: float, noise: float
 ) -> FloatArray:
     """Return the covariance of the fundamental of a rounded channel.
 
@@ -154,20 +154,20 @@ def rounding_covariance(
     Returns:
         Of (Re a, Im a), shape (2, 2), from draws that are the same at each call.
     """
-    t_s, model, first = one.t_s, fit.model, fit.model.first
+    t_s, model, first = series.t_s, fit.model, fit.model.first
     scale = time_scale(t_s)
     theta = fit.parameters([channel], scale)[0]
     weight = fit.inverse_gram[channel][first : first + 2]
     random = np.random.default_rng(0)
     amplitude = fit.fundamental[channel]
     reach = min(_RANGE * step / max(abs(amplitude), step), _SHARE)
-    half_sample = fit.omega * one.period_s / 2
-    varied = np.ones((draws(one.count), 3))
+    half_sample = fit.omega * series.period_s / 2
+    varied = np.ones((draws(series.count), 3))
     varied[:, 1] += reach * random.uniform(-1, 1, len(varied))
     varied[:, 2] = half_sample * random.uniform(-1, 1, len(varied))
     varied[::2, 2] = 0.0
     error = np.zeros((len(varied), 2))
-    origin = _origin(theta[0], float(one.values[0]), step)
+    origin = _origin(theta[0], float(series.values[0]), step)
     for part in chunks(t_s.size):
         rows = basis(t_s[part], fit.omega, model, scale)
         trend = theta[:first] @ rows[:first] - origin
@@ -183,7 +183,7 @@ def rounding_covariance(
 
 
 def hysteresis_covariance(
-    one: Series, fit: HarmonicFit, channel: int, step: float
+    series: Series, fit: HarmonicFit, channel: int, step: float
 ) -> FloatArray | None:
     """Return what hysteresis of a reading can move the fundamental by, as a covariance.
 
@@ -199,11 +199,11 @@ def hysteresis_covariance(
     amplitude = fit.fundamental[channel]
     if not abs(amplitude) > 2 * _HYSTERESES[-1] * step:
         return None
-    t_s, values = one.t_s, one.values
-    if one.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
-        index = np.sort(np.random.default_rng(0).choice(one.count, _LOOKED_AT, replace=False))
+    t_s, values = series.t_s, series.values
+    if series.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
+        index = np.sort(np.random.default_rng(0).choice(series.count, _LOOKED_AT, replace=False))
         t_s, values = t_s[index], values[index]
-    scale = time_scale(one.t_s)
+    scale = time_scale(series.t_s)
     rows = basis(t_s, fit.omega, fit.model, scale)
     residual = (values - fit.parameters([channel], scale)[0] @ rows) / step
     turns = fit.omega * t_s / (2 * np.pi) % 1

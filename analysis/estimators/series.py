@@ -159,17 +159,17 @@ def clean_together(signals: Mapping[str, Signal], origin_ns: int) -> dict[str, S
     Returns:
         The series by key.
     """
-    found: dict[str, Series] = {}
+    series: dict[str, Series] = {}
     times: dict[int, Series] = {}
-    for key, one in signals.items():
-        known = times.get(id(one.t_ns))
-        if known is not None and (np.abs(one.values) <= LARGEST).all():
-            found[key] = Series(one.name, known.t_s, frozen(one.values.view()))
+    for key, signal in signals.items():
+        known = times.get(id(signal.t_ns))
+        if known is not None and (np.abs(signal.values) <= LARGEST).all():
+            series[key] = Series(signal.name, known.t_s, frozen(signal.values.view()))
             continue
-        found[key] = made = clean(one.name, one.t_ns, one.values, origin_ns)
-        if np.may_share_memory(made.values, one.values):  # nothing was left out or moved
-            times[id(one.t_ns)] = made
-    return found
+        series[key] = made = clean(signal.name, signal.t_ns, signal.values, origin_ns)
+        if np.may_share_memory(made.values, signal.values):  # nothing was left out or moved
+            times[id(signal.t_ns)] = made
+    return series
 
 
 def gaps_after(step_s: FloatArray) -> IntArray:

@@ -284,8 +284,8 @@ def _posterior(
     shapes: Shapes, fits: Sequence[_Fits], noises: Sequence[_Noise], series: FloatArray
 ) -> _Posterior:
     """Weigh the grid; gains and lags share the trend, but have each their correlation."""
-    prior = np.array([one.prior for one in noises])[:, None]
-    log = np.stack([one.restricted.T for one in fits], axis=1)  # (2, noises, s)
+    prior = np.array([noise.prior for noise in noises])[:, None]
+    log = np.stack([fit.restricted.T for fit in fits], axis=1)  # (2, noises, s)
     weights, best = _weighed(log, prior)
     half = series.shape[0] // 2
     # What joints share shows once their scatter is white.
@@ -305,7 +305,7 @@ def _weighed(log: FloatArray, prior: FloatArray) -> tuple[FloatArray, list[tuple
     apart = np.sum(prior * other, axis=1, keepdims=True) / prior.sum()
     weights = prior * likely * (_SAME * other + (1 - _SAME) * apart)
     weights /= weights.sum(axis=(1, 2), keepdims=True)
-    return weights, [_best(one) for one in weights]
+    return weights, [_best(weight) for weight in weights]
 
 
 def _rest(shapes: Shapes, s: int, noise: _Noise, series: FloatArray) -> FloatArray:
@@ -322,7 +322,7 @@ def _clearest(series: FloatArray, place: FloatArray, noises: Sequence[_Noise]) -
         return none
     null = [_fit(none, noise, series) for noise in noises]
     weights = _posterior(none, null, noises, series).weights[:, :, 0]
-    likely = [np.flatnonzero(each >= _LIKELY).tolist() for each in weights]
+    likely = [np.flatnonzero(weight >= _LIKELY).tolist() for weight in weights]
     spread = range(1, len(noises), 5)
     tried = sorted({0, *likely[0], *likely[1], *spread})
     best, chosen = np.inf, none
@@ -338,7 +338,7 @@ def _clearest(series: FloatArray, place: FloatArray, noises: Sequence[_Noise]) -
             total += share
         if not _TRIALS[family.kind] * float(chance.min()) / total <= SIGNIFICANT:
             continue
-        full = np.max([one.full for one in fits.values()], axis=0)
+        full = np.max([fit.full for fit in fits.values()], axis=0)
         value = _criterion(family, float(full.max()), series)
         if family.free and family.tau[int(np.argmax(full))] >= family.longest:
             value += _OUT_OF_REACH
@@ -361,7 +361,7 @@ def _zoomed(
     """Return transients on a grid as fine as the likelihood is narrow."""
     lowest, highest = float(shapes.tau.min()), shapes.longest
     for _ in range(_ZOOMS):
-        fits = [_fit(shapes, one, series) for one in noises]
+        fits = [_fit(shapes, noise, series) for noise in noises]
         weights = _posterior(shapes, fits, noises, series).weights[0].sum(axis=0)
         weights /= weights.max()
         spread = float(weights.sum() ** 2 / np.sum(weights**2))
@@ -469,10 +469,10 @@ def _mixture(
     """Return the mean and the interval of rows @ beta."""
     half = fits[0].rss.shape[1] // 2
     parts: list[tuple[FloatArray, FloatArray]] = []
-    for part, own in enumerate(weights):
+    for part, weight in enumerate(weights):
         mine, other = (slice(k * half, (k + 1) * half) for k in (part, 1 - part))
-        index: list[list[int]] = np.argwhere(own >= _LEAST_WEIGHT * own.max()).tolist()
-        share: FloatArray = np.array([own[i, s] for i, s in index])
+        index: list[list[int]] = np.argwhere(weight >= _LEAST_WEIGHT * weight.max()).tolist()
+        share: FloatArray = np.array([weight[i, s] for i, s in index])
         share = (share / share.sum())[:, None]
         mean: FloatArray = np.stack([rows[s] @ fits[i].beta[s][:, mine] for i, s in index])
         scale: FloatArray = np.stack([fits[i].rss[s][mine] for i, s in index]) / dof
@@ -483,5 +483,5 @@ def _mixture(
             mixture_interval(share, mean, np.sqrt(np.maximum(scale, _TINY)), dof * (1 + alike))
         )
     return Coefficients(
-        np.concatenate([one[0] for one in parts]), np.concatenate([one[1] for one in parts])
+        np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
     )

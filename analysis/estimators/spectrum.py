@@ -173,7 +173,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
             return common, common
         return common, _demodulated(group, fit, members, spans[members[0]])
 
-    found = in_threads(demodulated, groups, sum(one.count for one in series))
+    found = in_threads(demodulated, groups, sum(series.count for series in series))
     for members, (_, own) in zip(groups, found, strict=True):
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
@@ -347,9 +347,9 @@ class _Demodulated:
         return usable if np.any(usable) else self.kept == self.kept.max()
 
 
-def _span(one: Series) -> float:
+def _span(series: Series) -> float:
     """Return the length of a record, the last sample's own interval included [s]."""
-    return float(one.t_s[-1] - one.t_s[0]) * one.count / (one.count - 1)
+    return float(series.t_s[-1] - series.t_s[0]) * series.count / (series.count - 1)
 
 
 def _demodulated(
@@ -363,14 +363,14 @@ def _demodulated(
     # Demodulated, the bins turn a few times over the whole record: long records are summed in
     # blocks of less than a hundredth of a radian first.
     block = max(1, t_s.size // _BLOCKS)
-    for one in residuals(group, fit, members):
-        count = one.part.stop - one.part.start
+    for residual in residuals(group, fit, members):
+        count = residual.part.stop - residual.part.start
         edges: IntArray = np.arange(0, count, block, dtype=np.int64)
         filled = np.diff(np.concatenate((edges, [count])))
-        waves = _waves(np.add.reduceat(t_s[one.part], edges) / filled, 2 * np.pi / span, side)
-        real, imaginary = np.add.reduceat(one.turned, edges, axis=2)
+        waves = _waves(np.add.reduceat(t_s[residual.part], edges) / filled, 2 * np.pi / span, side)
+        real, imaginary = np.add.reduceat(residual.turned, edges, axis=2)
         transform += (real + 1j * imaginary) @ waves.T
-        overlap += _turned_rows(one.rows, edges, fit.model) @ waves.T
+        overlap += _turned_rows(residual.rows, edges, fit.model) @ waves.T
     removed = np.einsum("pl,pq,ql->l", overlap.conj(), fit.inverse_gram[members[0]], overlap).real
     return _Demodulated(transform, t_s.size - removed, t_s.size)
 

@@ -228,7 +228,7 @@ def _of_sweep(sweep: Sweep, examined: _Examined) -> Experiment:
     analyses, others = examined.analyses, set(range(len(examined.runs))).difference(sweep.index)
     for k in sorted(others):
         examined.warn(f"{examined.runs[k].label} is no run of the sweep; it is left out")
-    paths = [Path(one.session.path) for one in analyses]
+    paths = [Path(analysis.session.path) for analysis in analyses]
     coupling = sweep_coupling(sweep, examined.commanded, paths, examined.options, examined.warn)
     answer = broken_first(analyses, sweep_answer(coupling))
     roles, why = dict.fromkeys(sweep.index, "sweep"), dict.fromkeys(others, "is no run of it")
@@ -349,7 +349,7 @@ def _warn_headings(reversal: Reversal, warn: Warn) -> None:
 
 
 def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
-    paths = [one.session.path for one in analyses]
+    paths = [analysis.session.path for analysis in analyses]
     named = zip(paths, analyses, strict=True)
     return Provenance(
         command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),

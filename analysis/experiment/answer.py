@@ -140,9 +140,11 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
         )
 
 
-def _bands(one: Lti | ToneCoupling, joint: str = "", joints: str = "") -> str:
+def _bands(model: Lti | ToneCoupling, joint: str = "", joints: str = "") -> str:
     """Return the shares of the off-diagonal energy within one, two and three joints."""
-    shares = zip((one.within_1, one.within_2, one.within_3), (joint, joints, joints), strict=True)
+    shares = zip(
+        (model.within_1, model.within_2, model.within_3), (joint, joints, joints), strict=True
+    )
     return ", ".join(
         f"{formats.percent(share)} within {k}{word}" for k, (share, word) in enumerate(shares, 1)
     )
@@ -276,17 +278,17 @@ def broken_first(sessions: Sequence[Analysis], answer: str) -> str:
     Returns:
         The answer, with a clause for each of these joints and where it was so.
     """
-    found: dict[str, list[tuple[NotFollowing, str]]] = {}
-    for one in sessions:
-        for fault in one.answer.not_following:
+    faults: dict[str, list[tuple[NotFollowing, str]]] = {}
+    for session in sessions:
+        for fault in session.answer.not_following:
             if fault.kinds != ("lost_samples",):
-                found.setdefault(fault.joint, []).append((fault, Path(one.session.path).name))
+                faults.setdefault(fault.joint, []).append((fault, Path(session.session.path).name))
     clauses = [
         f"{fault_in_words(where[0][0])} ({_sessions([name for _, name in where], len(sessions))})"
-        for where in list(found.values())[:NAMED]
+        for where in list(faults.values())[:NAMED]
     ]
-    if len(found) > NAMED:
-        clauses.append(f"{len(found) - NAMED} more joints do not follow either")
+    if len(faults) > NAMED:
+        clauses.append(f"{len(faults) - NAMED} more joints do not follow either")
     return "; ".join([*clauses, answer])
 
 

@@ -179,24 +179,24 @@ def _warn_inputs(runs: Sequence[MultisineRun], counts: tuple[int, int], warn: Wa
 def _joint(
     joint: str,
     sharing: tuple[str, ...],
-    own: BestLinearApproximation,
+    approximation: BestLinearApproximation,
     freedom: int,
     frequency_hz: FloatArray,
 ) -> BestLinearJoint | None:
     """Return the result of one joint; None where no line has an interval."""
-    variance = own.total if own.realisations > 1 else own.noise
+    variance = approximation.total if approximation.realisations > 1 else approximation.noise
     every = np.full(frequency_hz.size, float(freedom))
-    lines = sound_lines(LineResponse(frequency_hz, own.value, variance, every))
+    lines = sound_lines(LineResponse(frequency_hz, approximation.value, variance, every))
     if not lines.frequency_hz.size:
         return None
     kept = np.isin(frequency_hz, lines.frequency_hz)
     response = joint_response(joint, str(Kind.PERIODIC), sharing, lines)
-    known = own.relative_distortion.value is not None
+    known = approximation.relative_distortion.value is not None
     return BestLinearJoint(
-        response=replace(response, distortion=own.relative_distortion.value),
-        noise_sd=_root(own.noise[kept]),
-        distortion_sd=_root(own.distortion[kept]) if known else None,
-        distortion=own.relative_distortion,
+        response=replace(response, distortion=approximation.relative_distortion.value),
+        noise_sd=_root(approximation.noise[kept]),
+        distortion_sd=_root(approximation.distortion[kept]) if known else None,
+        distortion=approximation.relative_distortion,
         odd=Estimate(),
         even=Estimate(),
     )
@@ -208,34 +208,34 @@ def _root(variance: FloatArray) -> tuple[float, ...] | None:
     return tuple(np.sqrt(np.maximum(variance, 0.0)).tolist())
 
 
-def _cross(joint: str, command: str, one: BestLinearApproximation) -> CrossResponse:
-    variance = one.total if one.realisations > 1 else one.noise
+def _cross(joint: str, command: str, approximation: BestLinearApproximation) -> CrossResponse:
+    variance = approximation.total if approximation.realisations > 1 else approximation.noise
     return CrossResponse(
         joint,
         command,
-        tuple(np.abs(one.value).tolist()),
-        tuple((-np.angle(one.value)).tolist()),
+        tuple(np.abs(approximation.value).tolist()),
+        tuple((-np.angle(approximation.value)).tolist()),
         _root(variance) or (),
     )
 
 
-def multisine_answer(found: BestLinearResponses | None) -> str:
+def multisine_answer(responses: BestLinearResponses | None) -> str:
     """Answer from the responses.
 
     Returns:
         One sentence without its full stop, intervals in square brackets.
     """
-    if found is None:
+    if responses is None:
         return "no best linear approximation: the warnings say why"
-    count = len(found.joints)
-    low, high = (line / found.period_s for line in (found.lines[0], found.lines[-1]))
+    count = len(responses.joints)
+    low, high = (line / responses.period_s for line in (responses.lines[0], responses.lines[-1]))
     lead = (
         f"best linear approximation of {count} joint{'s' if count > 1 else ''} at "
-        f"{len(found.lines)} lines from {low:.3g} to {high:.3g} Hz, "
-        f"{found.realisations} realisation{'s' if found.realisations > 1 else ''} of "
-        f"{found.periods} period{'s' if found.periods > 1 else ''}"
+        f"{len(responses.lines)} lines from {low:.3g} to {high:.3g} Hz, "
+        f"{responses.realisations} realisation{'s' if responses.realisations > 1 else ''} of "
+        f"{responses.periods} period{'s' if responses.periods > 1 else ''}"
     )
-    worst = max(found.joints, key=lambda one: one.distortion.value or 0.0)
+    worst = max(responses.joints, key=lambda one: one.distortion.value or 0.0)
     if worst.distortion.value is None:
         return f"{lead}: nonlinear distortion is not separable from noise"
     return f"{lead}: {_distortion(worst, count)}"
@@ -257,11 +257,11 @@ def _distortion(worst: BestLinearJoint, count: int) -> str:
     return f"nonlinear distortion {where}, {formats.percent(worst.distortion)} of the gain{orders}"
 
 
-def multisine_method(found: BestLinearResponses) -> str:
+def multisine_method(responses: BestLinearResponses) -> str:
     """Return the method as one sentence, beginning in lower case."""
     inputs = (
         "all commands the same"
-        if found.inputs == "same"
+        if responses.inputs == "same"
         else "orthogonal commands of all joints, so that the response to each is known (--json)"
     )
     return (

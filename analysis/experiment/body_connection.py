@@ -61,11 +61,11 @@ def body_connection(
         The model, or the reason why there is none; None where no session has a cycle. And by index
         why a session has no part in it.
     """
-    known = {k: one for k, one in enumerate(sessions) if one is not None}
+    known = {k: session for k, session in enumerate(sessions) if session is not None}
     if not known:
         return None, {}
     why = dict.fromkeys(
-        (k for k, one in enumerate(sessions) if one is None),
+        (k for k, session in enumerate(sessions) if session is None),
         "has no planar gait with the head's pose and all joint angles",
     )
     joints = next(iter(known.values())).cycle.joints
@@ -166,21 +166,21 @@ def _held_out(
 
 def _speed_ratio(cycle: GaitCycle, others: Sequence[GaitCycle]) -> float:
     """Return by which factor a gait's frequency is outside the others', 1 or less if inside."""
-    omega = [one.omega for one in others]
+    omega = [other.omega for other in others]
     return max(cycle.omega / max(omega), min(omega) / cycle.omega)
 
 
-def connection_answer(found: BodyConnection) -> str:
+def connection_answer(connection: BodyConnection) -> str:
     """Answer from the model in one sentence without its full stop."""
-    known = [one for one in found.predicted if one.why is None]
-    lead = f"how shape moves the body, from {found.why} (effective, first order)"
+    known = [one for one in connection.predicted if one.why is None]
+    lead = f"how shape moves the body, from {connection.why} (effective, first order)"
     if not known:
         return f"{lead}: no session is within the range of the others, so none is predicted"
     distance = [(np.hypot(_of(one.forward_m), _of(one.left_m)), _gone(one)) for one in known]
     off = float(np.median([abs(a - b) for a, b in distance]))
     gone = float(np.median([b for _, b in distance]))
     turn = [abs(_of(one.turn_rad) - _of(one.measured_turn_rad)) for one in known]
-    outside = len(found.predicted) - len(known)
+    outside = len(connection.predicted) - len(known)
     rest = f"; {outside} outside the range of the others" if outside else ""
     return (
         f"{lead}: each of {len(known)} sessions predicted from the others, median error of a "
@@ -190,19 +190,21 @@ def connection_answer(found: BodyConnection) -> str:
     )
 
 
-def _of(one: Estimate) -> float:
-    return one.value or 0.0
+def _of(estimate: Estimate) -> float:
+    return estimate.value or 0.0
 
 
-def _gone(one: PredictedTravel) -> float:
-    return float(np.hypot(_of(one.measured_forward_m), _of(one.measured_left_m)))
+def _gone(travel: PredictedTravel) -> float:
+    return float(np.hypot(_of(travel.measured_forward_m), _of(travel.measured_left_m)))
 
 
-def connection_detail(found: BodyConnection) -> list[str]:
+def connection_detail(connection: BodyConnection) -> list[str]:
     """Return sentences on the modes and what is identified."""
-    shares = ", ".join(f"{100 * _of(mode.share):.2g} %" for mode in found.modes)
-    number = "infinite" if found.condition_number is None else f"{found.condition_number:.3g}"
-    if found.identified:
+    shares = ", ".join(f"{100 * _of(mode.share):.2g} %" for mode in connection.modes)
+    number = (
+        "infinite" if connection.condition_number is None else f"{connection.condition_number:.3g}"
+    )
+    if connection.identified:
         known = "the connection A is identified (--json)"
     else:
         known = (
@@ -211,9 +213,9 @@ def connection_detail(found: BodyConnection) -> list[str]:
     modes = f"Shape modes with {shares} of the variance of all shapes"
     lines = [
         f"{modes}; condition number {number}: {known}.",
-        formats.sentence(f"the model is {found.label}"),
+        formats.sentence(f"the model is {connection.label}"),
     ]
-    bare = sum(one.why is None and one.forward_m.ci95 is None for one in found.predicted)
+    bare = sum(one.why is None and one.forward_m.ci95 is None for one in connection.predicted)
     if bare:
         lines.append(
             f"No interval for {bare} of the predictions: the gait's frequency is more than "

@@ -62,7 +62,7 @@ def kick_size(
         kicks: Of r runs, None of one of the base gait.
     """
     sizes = {
-        kind: [abs(one.size) for one in kicks if one is not None and one.kind is kind]
+        kind: [abs(kick.size) for kick in kicks if kick is not None and kick.kind is kind]
         for kind in Kind
     }
     phase = float(np.mean(sizes[Kind.PHASE]))
@@ -115,7 +115,7 @@ def _curvature(
     """Return second over first order of the phase kicks, Frobenius norms over all joints."""
     errors = matrices.steady_errors
     variance = float(np.maximum(errors.variance, errors.within).sum())
-    base = [k for k, one in enumerate(kicks) if one is None]
+    base = [k for k, kick in enumerate(kicks) if kick is None]
     middle = answers.log[base].mean(axis=0)
     even = odd = noise = 0.0
     for up, down in sides(kicks, Kind.PHASE).values():
@@ -168,10 +168,10 @@ def valid_to(predictions: Sequence[HeldOut]) -> float | None:
         there is none.
     """
     reached: float | None = None
-    for one in sorted(predictions, key=lambda p: p.size):
-        if one.error * BETTER > one.error_kept:
+    for prediction in sorted(predictions, key=lambda p: p.size):
+        if prediction.error * BETTER > prediction.error_kept:
             break
-        reached = one.size
+        reached = prediction.size
     return reached
 
 
@@ -326,17 +326,17 @@ def _base_response(
     )
 
 
-def _scatter(found: LocalMatrices) -> RunScatter:
-    m = len(found.P.value)
-    between, within = np.sqrt(found.errors.between), np.sqrt(found.errors.within)
+def _scatter(matrices: LocalMatrices) -> RunScatter:
+    m = len(matrices.P.value)
+    between, within = np.sqrt(matrices.errors.between), np.sqrt(matrices.errors.within)
     return RunScatter(
         tuple(between[:m].tolist()),
         tuple(between[m:].tolist()),
         tuple(within[:m].tolist()),
         tuple(within[m:].tolist()),
-        found.errors.dof,
-        rows_of(found.errors.correlation),
-        float(found.widened.max()),
+        matrices.errors.dof,
+        rows_of(matrices.errors.correlation),
+        float(matrices.widened.max()),
     )
 
 

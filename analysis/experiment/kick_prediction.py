@@ -189,8 +189,8 @@ def _limits(
 
 def _answer(modes: tuple[LoopMode, ...], eps: float) -> str:
     slowest = modes[0].rate
-    grows = sum(one.rate.ci95 is not None and one.rate.ci95[1] < 0 for one in modes)
-    relaxes = sum(one.rate.ci95 is not None and one.rate.ci95[0] > 0 for one in modes)
+    grows = sum(mode.rate.ci95 is not None and mode.rate.ci95[1] < 0 for mode in modes)
+    relaxes = sum(mode.rate.ci95 is not None and mode.rate.ci95[0] > 0 for mode in modes)
     counts = (
         (relaxes, "relaxes", "relax"),
         (grows, "grows", "grow"),

@@ -151,7 +151,7 @@ def sort_kicks_within(command: ComplexArray, same: float, most: float) -> Kicked
             best = found
     if best is None:
         return None
-    different = {(one.joint, one.kind, one.size > 0) for one in best.kicks.values()}
+    different = {(kick.joint, kick.kind, kick.size > 0) for kick in best.kicks.values()}
     return best if len(different) > 1 else None
 
 
@@ -166,7 +166,7 @@ def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tu
     """
     lacking: list[str] = []
     for joint, name in enumerate(names):
-        sizes = [one.size for one in kicks if one.kind is kind and one.joint == joint]
+        sizes = [kick.size for kick in kicks if kick.kind is kind and kick.joint == joint]
         up, down = [x for x in sizes if x > 0], [x for x in sizes if x < 0]
         if not sizes:
             lacking.append(f"{name} not at all")
@@ -268,10 +268,10 @@ def _experiment(
         runs=found,
         names=base.names,
         command=base.command,
-        ratio=np.stack([one.ratio for one in responses]),
-        log_gain_variance=np.stack([one.log_gain_variance for one in responses]),
-        lag_variance=np.stack([one.lag_variance for one in responses]),
-        dof=np.stack([one.dof for one in responses]),
+        ratio=np.stack([response.ratio for response in responses]),
+        log_gain_variance=np.stack([response.log_gain_variance for response in responses]),
+        lag_variance=np.stack([response.lag_variance for response in responses]),
+        dof=np.stack([response.dof for response in responses]),
         labels=tuple(run.label for run in runs),
         frequency_hz=base.frequency_hz,
     )

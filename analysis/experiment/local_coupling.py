@@ -309,8 +309,8 @@ def local_matrices(
         kicks: Of r runs, None of one of the base gait.
         amplitude: Whether amplitudes are kicked both ways, too.
     """
-    kicked = [k for k, one in enumerate(kicks) if one is not None]
-    each = [one for one in kicks if one is not None]
+    kicked = [k for k, kick in enumerate(kicks) if kick is not None]
+    each = [kick for kick in kicks if kick is not None]
     of_kicks = answers.select(kicked)
 
     def differences(errors: RunErrors | None, kind: Kind) -> tuple[NoisyMatrix, NoisyMatrix]:
@@ -326,7 +326,7 @@ def local_matrices(
         run_errors(kicks, answers.log, variance, derivatives, pairs=pairs, rows=rows)
         for pairs, rows in ((True, False), (True, True), (False, True))
     )
-    sums = [row_sums(one) for one in differences(without, Kind.PHASE)]
+    sums = [row_sums(difference) for difference in differences(without, Kind.PHASE)]
     agree = np.stack([_agree(one, to) for one, to in zip(sums, (1.0, 0.0), strict=True)])
     widened = np.stack(list(map(_widening, sums, (1.0, 0.0), agree)))
     P, R = _widen(differences(errors, Kind.PHASE), widened)
@@ -354,9 +354,9 @@ def _widen(
     """Multiply the errors by each row's factor, which as many sums determine."""
     m = len(factor[0])
 
-    def wider(one: NoisyMatrix, by: FloatArray) -> NoisyMatrix:
+    def wider(matrix: NoisyMatrix, by: FloatArray) -> NoisyMatrix:
         if np.all(by == 1.0):
-            return one
-        return replace(one, error=one.error * by[:, None], dof=np.minimum(one.dof, m))
+            return matrix
+        return replace(matrix, error=matrix.error * by[:, None], dof=np.minimum(matrix.dof, m))
 
     return wider(pair[0], factor[0]), wider(pair[1], factor[1])

@@ -186,7 +186,11 @@ def multisine_run(
     record = session.metadata.get("undulog.plan", {})
     design = planned_design(record, str(session.path))
     commands, positions, _ = read_signals(session, options)
-    swing = {name: float(np.ptp(one.values)) for name, one in commands.items() if one.count > 1}
+    swing = {
+        name: float(np.ptp(command.values))
+        for name, command in commands.items()
+        if command.count > 1
+    }
     least = DRIVEN_SHARE * max(swing.values(), default=0.0)
     driven = {name: commands[name] for name, size in swing.items() if size > least}
     if design is None:
@@ -252,13 +256,13 @@ def _spectra(
         if inside.count < 2 or np.diff(inside.t_s).max() > max(_LONG_GAP * T, 4 * step_s):
             raise DataError(f"has a gap at {one.name} within its steady periods")
 
-    def spectrum(one: Series) -> ComplexArray:
-        values = resampled(one, t_s).reshape(periods, length)
+    def spectrum(series: Series) -> ComplexArray:
+        values = resampled(series, t_s).reshape(periods, length)
         return (np.fft.rfft(values, axis=1)[:, : design.lines[-1] + 1] / length).astype(
             np.complex128
         )
 
-    u = np.stack([spectrum(one).mean(axis=0) for one in commands.values()])
+    u = np.stack([spectrum(command).mean(axis=0) for command in commands.values()])
     lines: IntArray = np.array(design.lines)
     command = u[:, lines]
     size = np.abs(command)
@@ -271,7 +275,7 @@ def _spectra(
         tuple(commands),
         robot,
         command,
-        {name: spectrum(one) for name, one in responses.items()},
+        {name: spectrum(response) for name, response in responses.items()},
         float(impurity),
     )
 
@@ -287,7 +291,7 @@ def _steady_periods(
     (start_s, stop_s), T = limits, design.period_s
     count = int((stop_s - start_s) / T * length + 1e-6) + 1
     t_s = stop_s - np.arange(count)[::-1] * T / length
-    values = np.stack([resampled(one, t_s) for one in commands])
+    values = np.stack([resampled(command, t_s) for command in commands])
     power = float(np.sum(np.var(values, axis=1)))
     differ = np.sum((values[:, length:] - values[:, :-length]) ** 2, axis=0)
     total: FloatArray = np.concatenate([[0.0], np.cumsum(differ)])
@@ -317,34 +321,34 @@ def find_multisine(runs: Sequence[MultisineRun | str | None]) -> MultisineRuns |
     model = best[0][1]
     seen: dict[bytes, int] = {}
     chosen: dict[int, MultisineRun] = {}
-    for k, one in best:
-        numbers = b"".join(spectrum.tobytes() for spectrum in one.response.values())
+    for k, run in best:
+        numbers = b"".join(spectrum.tobytes() for spectrum in run.response.values())
         if numbers in seen:
             why[k] = "is a copy of another session's numbers: a copy is not a run of its own"
             continue
         seen[numbers] = k
-        chosen[k] = one
+        chosen[k] = run
     if len(chosen) < 2:
         return None
-    for k, one in known:
+    for k, run in known:
         if k not in chosen and k not in why:
             differs = (
                 "names another experiment"
-                if one.design.plan != model.design.plan
+                if run.design.plan != model.design.plan
                 else ("has another robot, other driven joints, another period or other lines")
             )
             why[k] = f"{differs} than the others"
-    for k, one in enumerate(runs):
-        if one is None:
+    for k, run in enumerate(runs):
+        if run is None:
             why[k] = "commands no multisine of this experiment"
     return MultisineRuns(tuple(chosen), _numbered([*chosen.values()]), why)
 
 
-def _alike(one: MultisineRun, model: MultisineRun) -> bool:
-    a, b = one.design, model.design
+def _alike(run: MultisineRun, model: MultisineRun) -> bool:
+    a, b = run.design, model.design
     return (
         (a.plan, a.lines, a.inputs) == (b.plan, b.lines, b.inputs)
-        and (one.names, one.robot) == (model.names, model.robot)
+        and (run.names, run.robot) == (model.names, model.robot)
         and abs(a.period_s - b.period_s) <= _SAME_LINES_S * b.period_s
     )
 
@@ -363,11 +367,11 @@ def _numbered(runs: Sequence[MultisineRun]) -> tuple[MultisineRun, ...]:
     return tuple(found)
 
 
-def _same_phases(one: MultisineRun, other: MultisineRun) -> bool:
+def _same_phases(run: MultisineRun, other: MultisineRun) -> bool:
     """Return whether two commands are one but for a shift of time."""
-    lines: IntArray = np.array(one.design.lines)
+    lines: IntArray = np.array(run.design.lines)
     spectrum = np.zeros(32 * int(lines[-1]), dtype=np.complex128)
-    spectrum[lines] = np.sum(one.command * other.command.conj(), axis=0)
+    spectrum[lines] = np.sum(run.command * other.command.conj(), axis=0)
     correlation = float(np.fft.ifft(spectrum).real.max()) * spectrum.size
-    norm = float(np.linalg.norm(one.command) * np.linalg.norm(other.command))
+    norm = float(np.linalg.norm(run.command) * np.linalg.norm(other.command))
     return correlation > SAME_COMMAND * norm

@@ -129,7 +129,10 @@ def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTes
     named: tuple[int, ...] = ()
     p = np.ones(len(kinds))
     whole: tuple[FloatArray, FloatArray] | None = None
-    beyond_reach, reaches = False, {one.name: one.reach for one in model.parameters}
+    beyond_reach, reaches = (
+        False,
+        {parameter.name: parameter.reach for parameter in model.parameters},
+    )
     reach = np.array([reaches.get(kind, np.inf) for kind in model.modules])
     while True:
         x, system = _linear(np.log(response.ratio), variance, joints, model, named)
@@ -297,7 +300,7 @@ def analyse_with_null(
     analysis = measured.analysis
     response, joints = _answered(measured, model, file)
     result = _result(null_test(response, joints, model), model, file)
-    outside = [one.name for one in result.parameters if not one.within]
+    outside = [parameter.name for parameter in result.parameters if not parameter.within]
     warnings = list(analysis.warnings)
     if outside:
         warnings.append(
@@ -322,7 +325,7 @@ def _answered(
         fault = f"it is of {robot or 'no known robot'}, the model of {model.robot}"
     if fault is not None or gait is None or gait.response is None:
         raise UsageError(f"{path} can't be held to {file}: {fault or 'it has no gain and lag'}")
-    sound = {one.name for one in measured.analysis.joints if one.lag_rad.value is not None}
+    sound = {joint.name for joint in measured.analysis.joints if joint.lag_rad.value is not None}
     chosen = [k for k, name in enumerate(gait.answered) if name in sound]
     joints = np.array([model.joints.index(gait.answered[k]) for k in chosen], dtype=np.int64)
     return gait.response.select(chosen), joints
@@ -379,16 +382,19 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
         made_by=model.made_by,
         parameters=tuple(
             SharedEstimate(
-                name=one.name,
-                unit=one.unit,
-                assumed=one.value,
+                name=parameter.name,
+                unit=parameter.unit,
+                assumed=parameter.value,
                 fitted=Estimate(
-                    one.value * float(np.exp(x)),
-                    (one.value * float(np.exp(x - r)), one.value * float(np.exp(x + r))),
+                    parameter.value * float(np.exp(x)),
+                    (
+                        parameter.value * float(np.exp(x - r)),
+                        parameter.value * float(np.exp(x + r)),
+                    ),
                 ),
-                within=bool(abs(x) <= one.reach),
+                within=bool(abs(x) <= parameter.reach),
             )
-            for one, x, r in zip(model.parameters, test.x, reach, strict=True)
+            for parameter, x, r in zip(model.parameters, test.x, reach, strict=True)
         ),
         fit=test.fit,
         fit_p=test.fit_p,

@@ -68,8 +68,8 @@ def experiment_indices(
     found: dict[str, tuple[float | None, Interval | None, float | None]] = {}
     if reversal is not None:
         module, boundary = reversal.module_share, reversal.boundary_share
-        gain = max(abs(one.log_gain_difference.value or 0.0) for one in reversal.joints)
-        lag = max(abs(one.lag_difference_rad.value or 0.0) for one in reversal.joints)
+        gain = max(abs(joint.log_gain_difference.value or 0.0) for joint in reversal.joints)
+        lag = max(abs(joint.lag_difference_rad.value or 0.0) for joint in reversal.joints)
         found = {
             "mirror_response": (reversal.statistic, None, reversal.p),
             "module_share": (module.value, module.ci95, reversal.p),
@@ -85,7 +85,7 @@ def experiment_indices(
 
 def _common_response(ways: list[ComplexArray]) -> Index:
     """Return F of H0 over the means of each way's runs, each way about its own mean."""
-    known = [one for one in ways if len(one) >= MIN_RUNS and one.shape[1] > 1]
+    known = [way for way in ways if len(way) >= MIN_RUNS and way.shape[1] > 1]
     ratio = p = None
     if known:
         values = np.concatenate([parts(one.mean(axis=0)) for one in known])
@@ -131,17 +131,17 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
     Raises:
         UsageError: If there is no run, or the runs are not of m joints.
     """
-    if not runs or any(len(one.ratio) != len(names) for one in runs):
+    if not runs or any(len(run.ratio) != len(names) for run in runs):
         raise UsageError(
-            f"{[len(one.ratio) for one in runs]} joints in the runs, {len(names)} named: pooling "
+            f"{[len(run.ratio) for run in runs]} joints in the runs, {len(names)} named: pooling "
             "needs at least one run, and the same joints in all"
         )
     sound = [
-        np.isfinite(one.ratio) & np.isfinite(one.log_gain_variance) & np.isfinite(one.lag_variance)
-        for one in runs
+        np.isfinite(run.ratio) & np.isfinite(run.log_gain_variance) & np.isfinite(run.lag_variance)
+        for run in runs
     ]
     known = np.flatnonzero(np.all(sound, axis=0))
-    chosen = [one.select(known.tolist()) for one in runs]
+    chosen = [run.select(known.tolist()) for run in runs]
     ratio = np.stack([one.ratio for one in chosen])
     turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
     phase = turn + np.angle(ratio * np.exp(-1j * turn))  # of a joint within pi of their mean

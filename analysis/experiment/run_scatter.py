@@ -163,12 +163,12 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
     """Compare each run with the mean of all runs of its commands; copied files don't count."""
     groups: dict[tuple[int, Kind, bool] | None, list[int]] = {}
     seen: set[bytes] = set()
-    for k, one in enumerate(kicks):
+    for k, kick in enumerate(kicks):
         numbers = values[k].tobytes()
         if numbers in seen:
             continue
         seen.add(numbers)
-        key = None if one is None else (one.joint, one.kind, one.size > 0)
+        key = None if kick is None else (kick.joint, kick.kind, kick.size > 0)
         groups.setdefault(key, []).append(k)
     rows = np.eye(len(kicks))
     for group in groups.values():
@@ -201,10 +201,10 @@ def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int]
         Indices of runs for each joint that is kicked both ways.
     """
     runs: dict[int, tuple[list[int], list[int]]] = {}
-    for k, one in enumerate(kicks):
-        if one is not None and one.kind is kind:
-            up, down = runs.setdefault(one.joint, ([], []))
-            (up if one.size > 0 else down).append(k)
+    for k, kick in enumerate(kicks):
+        if kick is not None and kick.kind is kind:
+            up, down = runs.setdefault(kick.joint, ([], []))
+            (up if kick.size > 0 else down).append(k)
     return {joint: runs[joint] for joint in sorted(runs) if all(runs[joint])}
 
 

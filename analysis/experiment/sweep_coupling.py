@@ -171,12 +171,12 @@ def servo_side(servos: Sequence[Servo], omega: float) -> tuple[ComplexArray, Com
         omega: Angular frequency [rad/s].
     """
     sides: list[tuple[complex, complex]] = []
-    for one in servos:
-        winding = one.torque_constant / one.resistance_ohm
-        kappa = winding * one.supply_v * one.proportional_gain
-        damping = one.viscous_friction + winding * one.torque_constant
-        M = -(omega**2) * one.rotor_inertia + 1j * omega * damping
-        G = one.gear_stiffness + 1j * omega * one.gear_damping
+    for servo in servos:
+        winding = servo.torque_constant / servo.resistance_ohm
+        kappa = winding * servo.supply_v * servo.proportional_gain
+        damping = servo.viscous_friction + winding * servo.torque_constant
+        M = -(omega**2) * servo.rotor_inertia + 1j * omega * damping
+        G = servo.gear_stiffness + 1j * omega * servo.gear_damping
         sides.append((G * kappa / (M + G), G * (kappa + M) / (M + G)))
     table = np.array(sides, dtype=np.complex128).reshape(-1, 2)
     return table[:, 0], table[:, 1]
@@ -306,7 +306,9 @@ def _servos(data: SweepData, names: Sequence[str]) -> tuple[list[Servo] | None, 
     if any(name not in joints for name in names):
         return None, f"{robot.name} has other joints"
     servos = [joints[name] for name in names]
-    if any(max(one.coulomb_friction, one.static_friction, one.backlash) > 0 for one in servos):
+    if any(
+        max(servo.coulomb_friction, servo.static_friction, servo.backlash) > 0 for servo in servos
+    ):
         return None, "the servos have Coulomb friction or play, and are not linear"
     return servos, ""
 
@@ -332,7 +334,7 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
         )
     if beside.value is None:
         warn("too short to measure energy beside the tones; record two periods of the multisine")
-    bent = [(one.frequency_hz, one.distortion or 0.0) for one in tones]
+    bent = [(tone.frequency_hz, tone.distortion or 0.0) for tone in tones]
     if at := ", ".join(f"{hz:.4g} Hz ({100 * by:.2g} %)" for hz, by in bent if by > NONLINEAR):
         warn(
             "not linear: where nothing is commanded, lines reach more than 1 % of the tone beside "

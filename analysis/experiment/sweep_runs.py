@@ -128,15 +128,19 @@ def command_tones(
         if float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum()) < _PURE:
             omega = np.array([gait.fit.omega])
             return CommandTones(gait.driven, robot, omega, gait.fit.fundamental[:m, None])
-    commands = [one for one in read_signals(session, options)[0].values() if one.count > 64]
-    found = find_tones(commands)
-    if found is None:
+    commands = [
+        read_signal
+        for read_signal in read_signals(session, options)[0].values()
+        if read_signal.count > 64
+    ]
+    tones = find_tones(commands)
+    if tones is None:
         return None
-    amplitude = fit_tones(commands, found, np.zeros(0)).amplitude
+    amplitude = fit_tones(commands, tones, np.zeros(0)).amplitude
     size = np.abs(amplitude).max(axis=1)
     driven: BoolArray = size > DRIVEN_SHARE * size.max()
-    names = tuple(one.name for one, moves in zip(commands, driven, strict=True) if moves)
-    return CommandTones(names, robot, found, amplitude[driven])
+    names = tuple(command.name for command, moves in zip(commands, driven, strict=True) if moves)
+    return CommandTones(names, robot, tones, amplitude[driven])
 
 
 def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
@@ -146,7 +150,11 @@ def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
         # Of two joints, a wave and its reverse are a lag sweep, too: they stay a reversal.
         if model is None or len(model.names) < 3:
             continue
-        index = [k for k, one in enumerate(sessions) if one is not None and _alike(one, model)]
+        index = [
+            k
+            for k, session in enumerate(sessions)
+            if session is not None and _alike(session, model)
+        ]
         found = _sweep(index, [one for k in index if (one := sessions[k]) is not None])
         if found is not None and (best is None or _rank(found) > _rank(best)):
             best = found
@@ -157,17 +165,17 @@ def _rank(sweep: Sweep) -> tuple[bool, int]:
     return sweep.lacking == 0, len(sweep.index)
 
 
-def _alike(one: CommandTones, model: CommandTones) -> bool:
-    if (one.names, one.robot, one.omega.size) != (model.names, model.robot, model.omega.size):
+def _alike(tones: CommandTones, model: CommandTones) -> bool:
+    if (tones.names, tones.robot, tones.omega.size) != (model.names, model.robot, model.omega.size):
         return False
-    if np.any(np.abs(one.omega - model.omega) > SAME_FREQUENCY * model.omega):
+    if np.any(np.abs(tones.omega - model.omega) > SAME_FREQUENCY * model.omega):
         return False
-    ratio = np.linalg.norm(one.command) / np.linalg.norm(model.command)
+    ratio = np.linalg.norm(tones.command) / np.linalg.norm(model.command)
     return bool(1 / _ALIKE < ratio < _ALIKE)
 
 
 def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
-    C = np.stack([one.command for one in runs], axis=1)  # joints, runs, lines
+    C = np.stack([run.command for run in runs], axis=1)  # joints, runs, lines
     m, r, lines = C.shape
     if r >= m:
         tones = tuple(k for k in range(lines) if np.linalg.cond(C[:, :, k]) <= MOST_CONDITION)
@@ -252,15 +260,15 @@ def sweep_data(
         responses.append(fit_tones(series, tones.omega, own))
         if all(name in effort for name in sweep.names):
             torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, own))
-        periods_s.append(max(one.period_s for one in commanded_series))
+        periods_s.append(max(commanded_series.period_s for commanded_series in commanded_series))
         drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
-    touched = [None if one is None else one.contact for one in twins]
+    touched = [None if twin is None else twin.contact for twin in twins]
     at = list(sweep.tones)
     whole = len(torques) == len(responses)
     free = range(omega[0].size, omega[0].size + lines.size)
     return SweepData(
         omega=np.mean([one[at] for one in omega], axis=0),
-        command=np.stack([one[:, at] for one in commands], axis=-1).swapaxes(0, 1),
+        command=np.stack([command[:, at] for command in commands], axis=-1).swapaxes(0, 1),
         response=_phasors(responses, at),
         torque=_phasors(torques, at) if whole else None,
         beside=Beside(lines, _phasors(responses, free)) if lines.size else None,
@@ -275,12 +283,12 @@ def sweep_data(
 
 def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> FloatArray:
     """Return frequencies at which only a nonlinear robot responds."""
-    highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
+    highest = NYQUIST_SHARE * 2 * np.pi / max(series.period_s for series in series)
     if omega.size == 1:
         lines: FloatArray = omega[0] * np.array([2.0, 3.0])
         return lines[lines < highest]
     step = common_step(omega)
-    span = min(float(one.t_s[-1] - one.t_s[0]) for one in series)
+    span = min(float(series.t_s[-1] - series.t_s[0]) for series in series)
     if step is None or step * span < 2 * np.pi * _PERIODS:
         return np.zeros(0)
     top = min(round((omega[-1] + 2 * omega[0]) / step), _MOST_LINES)
@@ -297,9 +305,9 @@ def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> 
 def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ...]:
     return tuple(
         Phasors(
-            np.stack([one.amplitude[:, k] for one in fits], axis=1),
-            np.stack([one.variance[:, k] for one in fits], axis=1),
-            np.stack([one.dof[:, k] for one in fits], axis=1),
+            np.stack([fit.amplitude[:, k] for fit in fits], axis=1),
+            np.stack([fit.variance[:, k] for fit in fits], axis=1),
+            np.stack([fit.dof[:, k] for fit in fits], axis=1),
         )
         for k in lines
     )
@@ -313,7 +321,7 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     """
     middle = float(series[0].t_s[0] + series[0].t_s[-1]) / 2
     ends = ((-np.inf, middle), (middle, np.inf))
-    halves = [[one.between(start, stop) for one in series] for start, stop in ends]
+    halves = [[series.between(start, stop) for series in series] for start, stop in ends]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
     tones = omega.size
     first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)

@@ -126,8 +126,8 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
 
 
 def _joined(parts: tuple[Phasors, ...]) -> Phasors:
-    columns = zip(*((one.value, one.variance, one.dof) for one in parts), strict=True)
-    return Phasors(*(np.concatenate(one, axis=1) for one in columns))
+    columns = zip(*((part.value, part.variance, part.dof) for part in parts), strict=True)
+    return Phasors(*(np.concatenate(column, axis=1) for column in columns))
 
 
 def find_tones(commands: Sequence[Series]) -> FloatArray | None:
@@ -140,14 +140,14 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
         Angular frequencies, rising [rad/s], at least two of them; None where the commands are no
         sum of a few tones, or all tones are harmonics of the lowest: that is a gait.
     """
-    moving = [one for one in commands if one.count > 64 and np.ptp(one.values) > 0]
+    moving = [command for command in commands if command.count > 64 and np.ptp(command.values) > 0]
     moving.sort(key=lambda one: float(np.var(one.values)), reverse=True)
     scouts = [_cut(one) for one in moving[:_SCOUTS]]
     if not scouts:
         return None
-    total = sum(float(np.sum(one.values**2)) for one in scouts)
+    total = sum(float(np.sum(scout.values**2)) for scout in scouts)
     omega: FloatArray = np.zeros(0)
-    residual: list[FloatArray] = [one.values for one in scouts]
+    residual: list[FloatArray] = [scout.values for scout in scouts]
     for _ in range(MOST_TONES):
         peak = _peak(scouts, residual)
         if peak is None or np.any(np.abs(omega - peak) < 2 * np.pi / _span(scouts)):
@@ -183,13 +183,13 @@ def common_step(omega: FloatArray) -> float | None:
     return None
 
 
-def _cut(one: Series) -> Series:
-    values = one.values[:_MOST_SAMPLES]
-    return Series(one.name, one.t_s[:_MOST_SAMPLES], values - values.mean())
+def _cut(series: Series) -> Series:
+    values = series.values[:_MOST_SAMPLES]
+    return Series(series.name, series.t_s[:_MOST_SAMPLES], values - values.mean())
 
 
 def _span(scouts: Sequence[Series]) -> float:
-    return max(float(one.t_s[-1] - one.t_s[0]) for one in scouts)
+    return max(float(scout.t_s[-1] - scout.t_s[0]) for scout in scouts)
 
 
 def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | None:
@@ -203,8 +203,8 @@ def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | N
     grid = start + period * np.arange(count)
     length = 1 << int(np.ceil(np.log2(4 * count)))
     power = np.zeros(length // 2 + 1)
-    for one, left in zip(scouts, residual, strict=True):
-        even = np.interp(grid, one.t_s, left) * np.hanning(count)
+    for scout, left in zip(scouts, residual, strict=True):
+        even = np.interp(grid, scout.t_s, left) * np.hanning(count)
         power += np.abs(np.fft.rfft(even, length)) ** 2
     frequency = np.fft.rfftfreq(length, period)
     inside = (frequency > 1.5 / (stop - start)) & (frequency < NYQUIST_SHARE / period)
@@ -224,15 +224,15 @@ def _refine(
     normal, right = np.zeros((tones, tones)), np.zeros(tones)
     sizes: list[FloatArray] = []
     left: list[FloatArray] = []
-    for one in scouts:
-        phase: FloatArray = omega[:, None] * one.t_s[None, :]
+    for scout in scouts:
+        phase: FloatArray = omega[:, None] * scout.t_s[None, :]
         cos, sin = np.cos(phase), np.sin(phase)
-        rows: FloatArray = np.concatenate([np.ones((1, one.count)), cos, -sin])
+        rows: FloatArray = np.concatenate([np.ones((1, scout.count)), cos, -sin])
         inverse: FloatArray = np.linalg.inv(rows @ rows.T).astype(np.float64)
-        theta: FloatArray = inverse @ (rows @ one.values)
+        theta: FloatArray = inverse @ (rows @ scout.values)
         re, im = theta[1 : 1 + tones, None], theta[1 + tones :, None]
-        rest: FloatArray = one.values - theta @ rows
-        slope: FloatArray = -one.t_s * (re * sin + im * cos)
+        rest: FloatArray = scout.values - theta @ rows
+        slope: FloatArray = -scout.t_s * (re * sin + im * cos)
         slope = slope - (slope @ rows.T) @ inverse @ rows
         normal += slope @ slope.T
         right += slope @ rest

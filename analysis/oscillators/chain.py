@@ -254,8 +254,8 @@ def closed_loop(
             warn(f"{options.excitation_topic}: not used, as there are no frequency responses")
         return None
     cause = _cause(session, options)
-    direct = [one.joint for one in responses if one.method == DIRECT]
-    if indirect := [one.joint for one in responses if one.method == INDIRECT]:
+    direct = [response.joint for response in responses if response.method == DIRECT]
+    if indirect := [response.joint for response in responses if response.method == INDIRECT]:
         warn(
             Note(
                 f"{', '.join(indirect)}: frequency response by the indirect method, response over "

@@ -244,7 +244,10 @@ def _explicit(P: NoisyMatrix) -> Estimate:
     value = explicit_coupling(P.value)
     if value is None:
         return Estimate()
-    draws = [explicit_coupling(P.value + one) for one in noise_draws(P, 41)[:EXPLICIT_DRAWS]]
+    draws = [
+        explicit_coupling(P.value + noise_draw)
+        for noise_draw in noise_draws(P, 41)[:EXPLICIT_DRAWS]
+    ]
     if None in draws:
         return Estimate(value)
     low, high = np.quantile(np.array(draws, dtype=np.float64), TAILS).tolist()

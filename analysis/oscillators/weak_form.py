@@ -102,7 +102,7 @@ def read_phases(
         for plane, joints in planes.items()
         if len(joints) > 1
     )
-    return tuple(one for one in logs if one is not None)
+    return tuple(log for log in logs if log is not None)
 
 
 def _log(

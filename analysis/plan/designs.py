@@ -404,15 +404,16 @@ def _poles(robot: Robot, plane: Plane) -> ComplexArray:
     """Return eigenvalues of (q, q', th, om), of the joints of one plane."""
     joints: list[Joint] = [joint for joint in robot.joints if joint.plane is plane]
     servos = [joint.servo for joint in joints]
-    winding = np.array([one.torque_constant / one.resistance_ohm for one in servos])
-    kappa = np.diag(winding * [one.supply_v * one.proportional_gain for one in servos])
+    winding = np.array([servo.torque_constant / servo.resistance_ohm for servo in servos])
+    kappa = np.diag(winding * [servo.supply_v * servo.proportional_gain for servo in servos])
     drag = np.diag(
-        winding * [one.torque_constant for one in servos] + [one.viscous_friction for one in servos]
+        winding * [servo.torque_constant for servo in servos]
+        + [servo.viscous_friction for servo in servos]
     )
-    k = np.diag([one.gear_stiffness for one in servos])
-    c = np.diag([one.gear_damping for one in servos])
+    k = np.diag([servo.gear_stiffness for servo in servos])
+    c = np.diag([servo.gear_damping for servo in servos])
     body = np.linalg.inv(transverse_mass(robot, plane))
-    rotor = np.diag([1 / one.rotor_inertia for one in servos])
+    rotor = np.diag([1 / servo.rotor_inertia for servo in servos])
     none, unit = np.zeros_like(k), np.eye(len(k))
     matrix = np.block(
         [

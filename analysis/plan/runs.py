@@ -65,7 +65,7 @@ def base_gait(session: SessionView) -> BaseGait:
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
     if gait.others:
-        frequencies = ", ".join(f"{one.fit.frequency_hz:.4g} Hz" for one in gait.groups)
+        frequencies = ", ".join(f"{group.fit.frequency_hz:.4g} Hz" for group in gait.groups)
         raise UsageError(
             f"{session.path}: its joints have several frequencies ({frequencies}); name a session "
             "of one"

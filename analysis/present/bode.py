@@ -49,20 +49,20 @@ WIDTH = 960.0
 _RIGHT = 8.0
 
 
-def bode(found: Sequence[JointFrequencyResponse], prefix: str) -> list[Drawing]:
+def bode(responses: Sequence[JointFrequencyResponse], prefix: str) -> list[Drawing]:
     """Draw the responses, :data:`JOINTS` joints a figure.
 
     Args:
-        found: In chain order.
+        responses: In chain order.
         prefix: For identifiers, unique in the page.
     """
-    groups = [found[k : k + JOINTS] for k in range(0, len(found), JOINTS)]
+    groups = [responses[k : k + JOINTS] for k in range(0, len(responses), JOINTS)]
     return [_figure(group, f"{prefix}-{k}") for k, group in enumerate(groups)]
 
 
-def best_linear_bode(found: Sequence[BestLinearJoint], prefix: str) -> list[Drawing]:
+def best_linear_bode(joints: Sequence[BestLinearJoint], prefix: str) -> list[Drawing]:
     """Draw best linear approximations likewise, with the noise and the distortion of each gain."""
-    groups = [found[k : k + JOINTS] for k in range(0, len(found), JOINTS)]
+    groups = [joints[k : k + JOINTS] for k in range(0, len(joints), JOINTS)]
     return [
         _figure([one.response for one in group], f"{prefix}-{k}", group)
         for k, group in enumerate(groups)
@@ -125,21 +125,21 @@ def _figure(
     )
 
 
-def _tips(one: JointFrequencyResponse, lines: Iterable[int], *, lag: bool) -> list[str]:
+def _tips(response: JointFrequencyResponse, lines: Iterable[int], *, lag: bool) -> list[str]:
     """Return the text of each line of a response, with its interval."""
     texts: list[str] = []
     for k in lines:
-        value = Estimate(one.gain[k], one.gain_ci95[k])
+        value = Estimate(response.gain[k], response.gain_ci95[k])
         if lag:
-            value = degrees(Estimate(one.lag_rad[k], one.lag_ci95[k]))
+            value = degrees(Estimate(response.lag_rad[k], response.lag_ci95[k]))
         shown = f"lag {estimate(value, '°')}" if lag else f"gain {estimate(value)}"
-        texts.append(f"{one.joint}: {shown} at {one.frequency_hz[k]:.4g} Hz")
+        texts.append(f"{response.joint}: {shown} at {response.frequency_hz[k]:.4g} Hz")
     return texts
 
 
-def _reach(one: JointFrequencyResponse, k: int) -> float:
+def _reach(response: JointFrequencyResponse, k: int) -> float:
     """Return the half width of a lag's interval [rad]; 0 where there is none."""
-    interval = one.lag_ci95[k]
+    interval = response.lag_ci95[k]
     return 0.0 if interval is None else (interval[1] - interval[0]) / 2
 
 

@@ -173,7 +173,7 @@ def comparison_view(comparison: Comparison) -> dict[str, Any]:
     return {
         "comparison": comparison,
         "sentence": comparison.answer,
-        "sides": [(letter, one) for letter, sessions in sides for one in sessions],
+        "sides": [(letter, session) for letter, sessions in sides for session in sessions],
         "facts": _facts(comparison),
         "marks": [joint_mark(colors[one.name], "horizontal") for one in comparison.named],
         "differences": differences_of(comparison, "differences") if names else None,
@@ -185,8 +185,12 @@ def comparison_view(comparison: Comparison) -> dict[str, Any]:
 
 def joints_of(comparison: Comparison) -> list[str]:
     """Return the names of the compared joints, head to tail if known from their mean cycles."""
-    return [one.name for one in comparison.waveforms] or sorted(
-        {one.place for one in comparison.differences if one.quantity in ("gain", "amplitude")}
+    return [waveform.name for waveform in comparison.waveforms] or sorted(
+        {
+            difference.place
+            for difference in comparison.differences
+            if difference.quantity in ("gain", "amplitude")
+        }
     )
 
 
@@ -200,7 +204,10 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
         prefix: For identifiers, unique in the page.
     """
     names = joints_of(comparison)
-    known = {(one.quantity, one.place): one.difference for one in comparison.differences}
+    known = {
+        (difference.quantity, difference.place): difference.difference
+        for difference in comparison.differences
+    }
     margins = {one.quantity: one.margin for one in comparison.equivalence}
     panels: list[Panel] = []
     for quantity, label, factor in (
@@ -249,10 +256,11 @@ def _facts(comparison: Comparison) -> list[Fact]:
             worst = max(of, key=lambda one: one.size)
             text = signed_difference(worst)
             facts.append(Fact(f"Largest in {WORDS[quantity]}", text, f"B minus A, {worst.place}"))
-    for one in comparison.differences:
-        if of_body(one.place):
-            text = signed_difference(one)
-            title = f"{one.place[len(BODY) + 2 :]} {WORDS[one.quantity]}".strip().capitalize()
+    for difference in comparison.differences:
+        if of_body(difference.place):
+            text = signed_difference(difference)
+            point = difference.place[len(BODY) + 2 :]
+            title = f"{point} {WORDS[difference.quantity]}".strip().capitalize()
             facts.append(Fact(title, text, "B minus A"))
     return facts
 
@@ -279,7 +287,9 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
             {
                 "history": history,
                 "facts": _fleet_facts(history),
-                "links": {one.path: _links(one.path, where, page) for one in history.outliers},
+                "links": {
+                    outlier.path: _links(outlier.path, where, page) for outlier in history.outliers
+                },
                 "figures": [
                     _change_drawing(history, change, joints, f"change-{k}-{n}")
                     for n, change in enumerate(history.changes[:_MOST_FIGURES])

@@ -56,7 +56,7 @@ def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.Dat
     Returns:
         One row each; without rows, the columns that every row would have.
     """
-    every = [row_of(one) for one in rows]
+    every = [row_of(row) for row in rows]
     frame = pd.DataFrame(every) if every else pd.DataFrame(columns=_columns(kind), dtype="str")
     for place, (name, values) in enumerate(more.items()):
         frame.insert(place, name, list(values))
@@ -94,7 +94,7 @@ def _cells(name: str, value: Any) -> dict[str, Any]:
         return dict(zip(("low", "high"), map(_number, value or (None, None)), strict=True))
     if isinstance(value, tuple):
         words = cast("tuple[Any, ...]", value)
-        return {name: " ".join(words)} if all(isinstance(one, str) for one in words) else {}
+        return {name: " ".join(words)} if all(isinstance(word, str) for word in words) else {}
     return {} if is_dataclass(value) or isinstance(value, dict) else {name: value}
 
 
@@ -167,9 +167,9 @@ def _of_analysis(result: Analysis) -> Frames:
         frames["body"] = table(BodyPoint, chain.from_iterable(models.values()), model=names)
     shape = result.body_shape
     if shape is not None and shape.planes:
-        planes = [str(one.plane or "") for one in shape.planes]
+        planes = [str(plane.plane or "") for plane in shape.planes]
         frames["serpenoid"] = table(
-            Serpenoid, [one.serpenoid for one in shape.planes], plane=planes
+            Serpenoid, [plane.serpenoid for plane in shape.planes], plane=planes
         )
     if shape is not None and shape.travel is not None:
         frames["travel"] = table(BodyTravel, [shape.travel])
@@ -179,8 +179,8 @@ def _of_analysis(result: Analysis) -> Frames:
 
 def _of_experiment(result: Experiment) -> Frames:
     sessions = result.sessions
-    joints = [joint for one in sessions for joint in one.joints]
-    whose = [one.session.path for one in sessions for _ in one.joints]
+    joints = [joint for session in sessions for joint in session.joints]
+    whose = [session.session.path for session in sessions for _ in session.joints]
     frames = {
         "runs": table(Run, result.runs),
         "joints": table(JointResult, joints, session=whose),
@@ -188,8 +188,8 @@ def _of_experiment(result: Experiment) -> Frames:
     }
     if result.reversal is not None:
         frames = frames_of(result.reversal) | frames
-    artefacts = [each for one in sessions for each in one.artefacts]
-    paths = [one.session.path for one in sessions for _ in one.artefacts]
+    artefacts = [artefact for session in sessions for artefact in session.artefacts]
+    paths = [session.session.path for session in sessions for _ in session.artefacts]
     frames["artefacts"] = _artefacts(artefacts, paths)
     if result.body_connection is not None and result.body_connection.predicted:
         frames["travel"] = table(PredictedTravel, result.body_connection.predicted)
@@ -235,10 +235,10 @@ def _of_comparison(result: Comparison) -> Frames:
     columns = ("a_rad", "b_rad", "difference_rad", "half_rad")
     waves = [
         pd.DataFrame(
-            {"name": one.name, "phase_rad": result.phase_rad}
-            | {name: getattr(one, name) for name in columns}
+            {"name": waveform.name, "phase_rad": result.phase_rad}
+            | {name: getattr(waveform, name) for name in columns}
         )
-        for one in result.waveforms
+        for waveform in result.waveforms
     ]
     return {
         "differences": table(Difference, result.differences),
@@ -252,7 +252,9 @@ def _of_comparison(result: Comparison) -> Frames:
 def _artefacts(artefacts: Sequence[Artefact], paths: Sequence[str] | None = None) -> pd.DataFrame:
     """Return one row a time window; its times are NaN if the artefact lasts throughout."""
     throughout: tuple[Span, ...] = ((float("nan"), float("nan")),)
-    rows = [(k, span) for k, one in enumerate(artefacts) for span in one.spans_s or throughout]
+    rows = [
+        (k, span) for k, artefact in enumerate(artefacts) for span in artefact.spans_s or throughout
+    ]
     more = {} if paths is None else {"session": [paths[k] for k, _ in rows]}
     frame = table(Artefact, [artefacts[k] for k, _ in rows], **more)
     frame["start_s"] = [start for _, (start, _) in rows]
@@ -302,16 +304,16 @@ def joint_table(sessions: Sequence[Analysis]) -> pd.DataFrame:
         The columns of the table ``joints`` behind ``session``, ``path``, and the first start, last
         stop and number of cycles of the windows that the joint's numbers are of.
     """
-    owners = [(one, joint) for one in sessions for joint in one.joints]
+    owners = [(session, joint) for session in sessions for joint in session.joints]
     windows = [_windows(one.gait, joint) for one, joint in owners]
     frame = table(
         JointResult,
         [joint for _, joint in owners],
         session=[one.session.id for one, _ in owners],
         path=[one.session.path for one, _ in owners],
-        start_s=[each[0] for each in windows],
-        stop_s=[each[1] for each in windows],
-        cycles=[each[2] for each in windows],
+        start_s=[window[0] for window in windows],
+        stop_s=[window[1] for window in windows],
+        cycles=[window[2] for window in windows],
     )
     return frame.drop(columns="dead_band", errors="ignore")  # a structure of its own
 
@@ -322,7 +324,7 @@ def _windows(gait: GaitFacts, joint: JointResult) -> tuple[float, float, float]:
     windows = windows or gait.windows
     if not windows:
         return float("nan"), float("nan"), 0.0
-    return windows[0].start_s, windows[-1].stop_s, sum(one.cycles for one in windows)
+    return windows[0].start_s, windows[-1].stop_s, sum(window.cycles for window in windows)
 
 
 def check_csv(path: Path, *, force: bool, several: bool = False) -> None:
@@ -369,9 +371,9 @@ def write_csv(
     check_csv(path, force=force, several=len(results) > 1)
     if path.suffix.lower() == SUFFIX:
         sessions = [
-            one
+            session
             for result in results
-            for one in (result.sessions if isinstance(result, Experiment) else (result,))
+            for session in (result.sessions if isinstance(result, Experiment) else (result,))
         ]
         files = {path: joint_table(sessions)}
     else:

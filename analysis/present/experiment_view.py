@@ -66,7 +66,7 @@ _MIRRORED: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 2))}
 def _sweep_facts(coupling: LinearCoupling) -> list[Fact]:
     """Return the key figures at the first tone."""
     tone = coupling.tones[0]
-    tones = ", ".join(f"{one.frequency_hz:.4g}" for one in coupling.tones)
+    tones = ", ".join(f"{tone.frequency_hz:.4g}" for tone in coupling.tones)
     contact = {True: "in contact", False: "without contact", None: "contact unknown"}
     what = "X" if tone.Z is None else "Z"
     at = f"{what} at {tone.frequency_hz:.4g} Hz"
@@ -109,7 +109,7 @@ def _sweep_trials(coupling: LinearCoupling) -> list[Trial]:
 
 def _linear(coupling: LinearCoupling) -> Trial:
     question = f"Is the chain linear for these motions, within {100 * NONLINEAR:g} %?"
-    known = [one.distortion for one in coupling.tones if one.distortion is not None]
+    known = [tone.distortion for tone in coupling.tones if tone.distortion is not None]
     if not known:
         return Trial(question, "records too short for lines beside the tones", None, "open")
     worst = max(known)
@@ -122,7 +122,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
     reversal, coupling, body = experiment.reversal, experiment.coupling, experiment.oscillators
     best, connection = experiment.best_linear, experiment.body_connection
     connection = connection if connection is not None and connection.fitted else None
-    joints = [joint for one in experiment.sessions for joint in one.joints]
+    joints = [joint for session in experiment.sessions for joint in session.joints]
     known = {joint.name for joint in joints if joint.gain.value is not None}
     names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
     entries = entries_of(coupling, names)
@@ -137,7 +137,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "sentence": formats.sentence(experiment.answer),
         "detail": [] if reversal is None else list(reversal_detail(reversal)),
         "facts": _facts(experiment),
-        "answers": [one.answer.sentence for one in experiment.sessions],
+        "answers": [session.answer.sentence for session in experiment.sessions],
         "mirror": None
         if reversal is None
         else mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure"),
@@ -145,7 +145,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "responses": None if best is None else best_linear_table(best.joints),
         "entries": entries,
         "matrices": [
-            matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
+            matrix_picture(entry, f"matrix-{k + 1}", small=k > 0) for k, entry in enumerate(entries)
         ],
         "checks": _checks(coupling),
         "travel": None if connection is None else travel_table(connection),
@@ -192,7 +192,7 @@ def _tables(experiment: Experiment, names: Sequence[str]) -> list[dict[str, Any]
     """Return gain and lag of every joint, one row a run."""
     if not names:
         return []
-    runs = [{joint.name: joint for joint in one.joints} for one in experiment.sessions]
+    runs = [{joint.name: joint for joint in session.joints} for session in experiment.sessions]
     rows = [[joints.get(name) for name in names] for joints in runs]
     gains = [[j and j.gain.value for j in row] for row in rows]
     lags = [[j and formats.degrees(j.lag_rad).value for j in row] for row in rows]
@@ -292,7 +292,7 @@ class Profiles(NamedTuple):
 
 def profiles(experiment: Experiment, reversal: Reversal) -> Profiles:
     """Return gain and lag of the joints that take part in a reversal test, run by run."""
-    names = [one.name for one in reversal.joints]
+    names = [joint.name for joint in reversal.joints]
 
     def of(role: str) -> tuple[FloatArray, FloatArray]:
         chosen = [
@@ -320,8 +320,8 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
     joints = reversal.joints
     colors = joint_hex(len(joints))
     tooltips: dict[str, str] = {}
-    gains = [relative(one.log_gain_difference) for one in joints]
-    lags = [degrees(one.lag_difference_rad) for one in joints]
+    gains = [relative(joint.log_gain_difference) for joint in joints]
+    lags = [degrees(joint.lag_difference_rad) for joint in joints]
     labels = ("gain [1]", "difference [%]", "lag [°]", "difference [°]")
     with drawing(6.6) as figure:
         rows = figure.subplots(4, 1, sharex=True, height_ratios=[1.35, 1, 1.35, 1])
@@ -331,7 +331,7 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
         _differences(rows[3], reversal, lags, colors, tooltips, what="lag")
         for axes, label in zip(rows, labels, strict=True):
             axes.set_ylabel(label)
-        joint_ticks(rows[3], [one.name for one in joints])
+        joint_ticks(rows[3], [joint.name for joint in joints])
         rows[3].set_xlabel("joint with the wave from head to tail, head on the left")
         figure.align_ylabels()
         middle = colors[len(colors) // 2]
@@ -409,14 +409,14 @@ def _mirror_in_words(reversal: Reversal) -> str:
     )
 
 
-def travel_drawing(found: BodyConnection) -> Drawing:
+def travel_drawing(connection: BodyConnection) -> Drawing:
     """Draw by how much the predicted travel of each session differs from the measured one."""
     panels = (
         ("forward", " mm", 1000.0, "forward_m"),
         ("left", " mm", 1000.0, "left_m"),
         ("turn", "°", math.degrees(1.0), "turn_rad"),
     )
-    known = [one for one in found.predicted if one.why is None]
+    known = [one for one in connection.predicted if one.why is None]
     tooltips: dict[str, str] = {}
     with drawing(2.7) as figure:
         for axes, (name, unit, scale, field) in zip(figure.subplots(1, 3), panels, strict=True):

@@ -139,17 +139,17 @@ def _entries(
 
 def _sweep(coupling: LinearCoupling) -> tuple[Entries, ...]:
     """Return Z, if known, and H at the first tone, then the first of them at the others."""
-    found: list[Entries] = []
+    entries: list[Entries] = []
     for k, tone in enumerate(coupling.tones):
         at = f"at {tone.frequency_hz:.4g} Hz"
         torque = f"torque over angle {at} [N m/rad]"
         response = f"response over command {at} [rad/rad]"
         suffix = f" {at}" if k else ""
         if tone.Z is not None:
-            found += _parts(f"Z{suffix}", torque, coupling.joints, tone.Z)
+            entries += _parts(f"Z{suffix}", torque, coupling.joints, tone.Z)
         if tone.Z is None or k == 0:
-            found += _parts(f"H{suffix}", response, coupling.joints, tone.H)
-    return tuple(found)
+            entries += _parts(f"H{suffix}", response, coupling.joints, tone.H)
+    return tuple(entries)
 
 
 def _parts(

@@ -325,16 +325,16 @@ def session_trials(indices: Mapping[str, Index]) -> list[Trial]:
 
 def experiment_trials(experiment: Experiment) -> list[Trial]:
     """Return the tests of several sessions together."""
-    found: list[Trial] = []
+    trials: list[Trial] = []
     indices = experiment.heterogeneity
     common = indices.get("common_response")
     if common is not None and common.value is not None:
-        found.append(_common(common, "the driven joints"))
+        trials.append(_common(common, "the driven joints"))
     if experiment.reversal is not None:
-        found += _reversal(experiment.reversal, indices)
+        trials += _reversal(experiment.reversal, indices)
     if isinstance(experiment.coupling, LocalCoupling):
-        found += _kicks(experiment.coupling)
-    return found
+        trials += _kicks(experiment.coupling)
+    return trials
 
 
 def _kicks(coupling: LocalCoupling) -> Iterable[Trial]:

@@ -19,23 +19,31 @@ from ..results.frequency_response import (
 from .tables import Column, Ends, Quantity, Table, typical
 
 
-def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:
+def frequency_table(responses: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:
     """Return frequency responses in short: band, bandwidth, delay, distortion, repeatability."""
 
-    def at_lowest(one: JointFrequencyResponse) -> Estimate:
-        return Estimate(one.gain[0], one.gain_ci95[0])
+    def at_lowest(response: JointFrequencyResponse) -> Estimate:
+        return Estimate(response.gain[0], response.gain_ci95[0])
 
-    def agree(one: JointFrequencyResponse) -> str | None:
-        return None if one.halves_agree is None else "{} of {}".format(*one.halves_agree)
+    def agree(response: JointFrequencyResponse) -> str | None:
+        return None if response.halves_agree is None else "{} of {}".format(*response.halves_agree)
 
-    def model(one: JointFrequencyResponse) -> str:
-        return "group delay" if one.delay_model is None else "model {}/{}".format(*one.delay_model)
+    def model(response: JointFrequencyResponse) -> str:
+        return (
+            "group delay"
+            if response.delay_model is None
+            else "model {}/{}".format(*response.delay_model)
+        )
 
-    def excitation(one: JointFrequencyResponse) -> str:
-        return one.excitation if one.method == DIRECT else f"{one.excitation}, {one.method}"
+    def excitation(response: JointFrequencyResponse) -> str:
+        return (
+            response.excitation
+            if response.method == DIRECT
+            else f"{response.excitation}, {response.method}"
+        )
 
-    def distortion(one: JointFrequencyResponse) -> Estimate:
-        return scaled(Estimate(one.distortion), 100.0)
+    def distortion(response: JointFrequencyResponse) -> Estimate:
+        return scaled(Estimate(response.distortion), 100.0)
 
     columns: list[Column[JointFrequencyResponse]] = [
         Column("joint", "joint", lambda one: one.joint, kind="word"),
@@ -56,7 +64,7 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
         "distortion [%]": "nonlinear, of the response; a dash where it can't be separated from "
         "noise",
     }
-    return Table(columns, found, about=about)
+    return Table(columns, responses, about=about)
 
 
 def tracking_table(joints: Sequence[JointTracking]) -> Table[JointTracking]:
@@ -134,15 +142,15 @@ def gait_joint_table(gaits: Sequence[GaitWindow]) -> Table[str]:
 
 def _ends(estimates: Sequence[Estimate], decimals: int) -> Ends | None:
     """Return the lowest and the highest value, or None where there is none."""
-    values = [each.value for each in estimates if each.value is not None]
+    values = [estimate.value for estimate in estimates if estimate.value is not None]
     if not values:
         return None
     return Ends(*(Quantity(Estimate(end), decimals) for end in (min(values), max(values))))
 
 
-def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
+def motion_table(motions: Sequence[JointMotion]) -> Table[JointMotion]:
     """Return amplitude, offset and lag of joints that move without commands."""
-    with_planes = any(one.plane for one in found)
+    with_planes = any(one.plane for one in motions)
     angle, lag = typical(2, 4), "lag behind the one before"
     columns: list[Column[JointMotion]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
@@ -151,7 +159,7 @@ def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
         Column("offset° (95 %)", "offset [°]", lambda one: degrees(one.offset_rad), angle, spare=1),
         Column(f"{lag}° (95 %)", f"{lag} [°]", lambda one: degrees(one.lag_rad), angle),
     ]
-    return Table(columns, found)
+    return Table(columns, motions)
 
 
 def local_waves_table(waves: Sequence[BodyWave]) -> Table[LocalWaveNumber]:
@@ -173,19 +181,19 @@ def local_waves_table(waves: Sequence[BodyWave]) -> Table[LocalWaveNumber]:
     return Table(columns, [part for wave in waves for part in wave.local], about=about)
 
 
-def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
+def wave_table(waves: Sequence[BodyWave]) -> Table[BodyWave]:
     """Return the waves along the body, one a plane."""
 
-    def way(one: BodyWave) -> str:
-        first, last = one.joints[0], one.joints[-1]
-        if one.direction == "undecided":
+    def way(wave: BodyWave) -> str:
+        first, last = wave.joints[0], wave.joints[-1]
+        if wave.direction == "undecided":
             return f"undecided, {first} and {last}"
-        return f"{first} to {last}" if one.direction == "first-to-last" else f"{last} to {first}"
+        return f"{first} to {last}" if wave.direction == "first-to-last" else f"{last} to {first}"
 
-    def off(one: BodyWave) -> float:
-        return math.degrees(one.deviation_rad)
+    def off(wave: BodyWave) -> float:
+        return math.degrees(wave.deviation_rad)
 
-    with_planes = any(one.plane for one in found)
+    with_planes = any(one.plane for one in waves)
     angle, share = typical(2, 4), typical(3, 4)
     columns: list[Column[BodyWave]] = [
         *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
@@ -206,4 +214,4 @@ def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
         "travelling index [1]": "1 of a travelling, 0 of a standing wave",
         "off the line [°]": "root mean square of the phases about the line",
     }
-    return Table(columns, found, about=about)
+    return Table(columns, waves, about=about)

@@ -126,13 +126,15 @@ def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a 
             raise TypeError(f"null where {kind} is expected")
         return None
     if origin in (Union, types.UnionType):
-        return _build(next(one for one in arguments if one is not type(None)), value)
+        return _build(next(argument for argument in arguments if argument is not type(None)), value)
     if origin in (tuple, dict) or dataclasses.is_dataclass(kind):
         _require(list if origin is tuple else dict, kind, value)
     if origin is tuple:
         if arguments[-1] is Ellipsis:
             return tuple(_build(arguments[0], one) for one in value)
-        return tuple(_build(one, part) for one, part in zip(arguments, value, strict=True))
+        return tuple(
+            _build(argument, part) for argument, part in zip(arguments, value, strict=True)
+        )
     if origin is dict:
         return {key: _build(arguments[1], one) for key, one in value.items()}
     return _dataclass(kind, value) if dataclasses.is_dataclass(kind) else _plain(kind, value)
@@ -390,14 +392,14 @@ def _of_experiment(result: Experiment) -> Pictures:
     from .experiment_view import mirror_profile, profiles
 
     reversal = result.reversal
-    known: Pictures = {}
+    pictures: Pictures = {}
     if reversal is not None:
-        known["mirror"] = partial(mirror_profile, profiles(result, reversal), reversal)
+        pictures["mirror"] = partial(mirror_profile, profiles(result, reversal), reversal)
     if result.coupling.matrix is not None:
-        known |= pictures_of(result.coupling)
-    if not known:
+        pictures |= pictures_of(result.coupling)
+    if not pictures:
         raise UsageError(f"{result!r}: nothing to draw together; plot its sessions one by one")
-    return known
+    return pictures
 
 
 def _of_comparison(result: Comparison) -> Pictures:
@@ -410,10 +412,10 @@ def _of_comparison(result: Comparison) -> Pictures:
 def _mirror_differences(result: Reversal, prefix: str) -> Drawing:
     from .comparison_view import Panel, differences_drawing
 
-    gains = [relative(one.log_gain_difference) for one in result.joints]
-    lags = [degrees(one.lag_difference_rad) for one in result.joints]
+    gains = [relative(joint.log_gain_difference) for joint in result.joints]
+    lags = [degrees(joint.lag_difference_rad) for joint in result.joints]
     return differences_drawing(
-        [one.name for one in result.joints],
+        [joint.name for joint in result.joints],
         [Panel("gain [%]", gains, 2.0), Panel("lag [°]", lags, 1.0)],
         title="Each joint against its mirror joint with the wave reversed",
         prefix=prefix,

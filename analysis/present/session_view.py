@@ -204,9 +204,11 @@ def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
     """
     order = {joint.name: place for place, joint in enumerate(analysis.joints)}
     alike: dict[tuple[object, ...], list[Artefact]] = {}
-    for one in analysis.artefacts:
-        spans = tuple((round(start, 1), round(stop, 1)) for start, stop in one.spans_s)
-        alike.setdefault((one.flag, one.quantity, one.topic, one.note, spans), []).append(one)
+    for artefact in analysis.artefacts:
+        spans = tuple((round(start, 1), round(stop, 1)) for start, stop in artefact.spans_s)
+        alike.setdefault(
+            (artefact.flag, artefact.quantity, artefact.topic, artefact.note, spans), []
+        ).append(artefact)
     groups = [sorted(same, key=lambda one: order.get(one.joint, 0)) for same in alike.values()]
     first = list(WHAT)
     groups.sort(key=lambda same: (first.index(same[0].about), order.get(same[0].joint, 0)))
@@ -261,7 +263,7 @@ def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
     )
 
 
-def _line(one: Artefact, analysis: Analysis) -> Markup:
+def _line(artefact: Artefact, analysis: Analysis) -> Markup:
     """Return the session as a line: analysed window light, the artefact's windows dark."""
     whole = analysis.session.duration_s or 1.0
     analysed = tuple((w.start_s, w.stop_s) for w in analysis.gait.windows)
@@ -276,7 +278,7 @@ def _line(one: Artefact, analysis: Analysis) -> Markup:
     return element(
         "svg",
         bars(analysed, "analysed", 0.0),
-        bars(one.spans_s or ((0.0, whole),), "held", 0.8),
+        bars(artefact.spans_s or ((0.0, whole),), "held", 0.8),
         viewBox="0 0 100 10",
         preserveAspectRatio="none",
         class_="spans",
@@ -359,18 +361,18 @@ def chain_view(chain: ChainCoupling, prefix: str) -> dict[str, Any]:
         "matrix": matrix_picture(_couplings(chain), prefix) if chain.links else None,
         "decimals": (  # of K, of the rates and of the feedback
             formats.decimals_for((link.K for link in chain.links), most=3),
-            formats.decimals_for((one.omega for one in rates), most=4),
-            formats.decimals_for((one.feedback for one in rates), most=3),
+            formats.decimals_for((rate.omega for rate in rates), most=4),
+            formats.decimals_for((rate.feedback for rate in rates), most=3),
         ),
         "lags": lags,
         "lag_decimals": formats.decimals_for(lags, most=2),
-        "fed": any(one.feedback.value is not None for one in rates),
+        "fed": any(rate.feedback.value is not None for rate in rates),
     }
 
 
 def _couplings(chain: ChainCoupling) -> Entries:
     """Return K as a matrix with NaN for couplings that were not estimated."""
-    names = tuple(one.name for one in chain.oscillators)
+    names = tuple(oscillator.name for oscillator in chain.oscillators)
     place = {name: k for k, name in enumerate(names)}
     value: FloatArray = np.full((len(names), len(names)), np.nan)
     half: FloatArray = np.zeros_like(value)

@@ -142,10 +142,10 @@ _kept: ContextVar[dict[str, Figure] | None] = ContextVar("figures", default=None
 @contextmanager
 def kept_figures() -> Generator[dict[str, Figure]]:
     """Keep the figures that :func:`inline_svg` writes meanwhile, by their prefix."""
-    found: dict[str, Figure] = {}
-    token = _kept.set(found)
+    figures: dict[str, Figure] = {}
+    token = _kept.set(figures)
     try:
-        yield found
+        yield figures
     finally:
         _kept.reset(token)
 
@@ -214,8 +214,8 @@ def _describe_panels(root: ET.Element, figure: Figure) -> None:
         group.set("data-panel", plain(json.dumps(facts, ensure_ascii=False)))
         for each in group.iter(f"{{{_SVG}}}g"):
             name = each.get("id", "")
-            if found := _TICK.match(name):
-                each.set("class", f"tick {found[1]}")
+            if match := _TICK.match(name):
+                each.set("class", f"tick {match[1]}")
             elif name.startswith(ABOVE):
                 each.set("class", "above")
 
@@ -225,11 +225,11 @@ def _scale(figure: Figure, axes: Axes, name: str) -> list[object]:
     axis = getattr(axes, f"{name}axis")
     shared = getattr(axes, f"get_shared_{name}_axes")()
     together = [
-        k for k, each in enumerate(figure.axes) if each is axes or shared.joined(axes, each)
+        k for k, axis in enumerate(figure.axes) if axis is axes or shared.joined(axes, axis)
     ]
     labels: list[str] = [getattr(figure.axes[k], f"get_{name}label")() for k in together]
     labels.append(getattr(figure, f"get_sup{name}label")())
-    label = next((each for each in labels if each), "")
+    label = next((label for label in labels if label), "")
     fixed = isinstance(axis.get_major_locator(), _FIXED)
     kind = "fixed" if fixed else axis.get_scale()
     return [*map(float, getattr(axes, f"get_{name}lim")()), kind, together[0], label]
@@ -298,9 +298,9 @@ def _plain_text_style(text: ET.Element) -> None:
         ("font-weight", _FONT_WEIGHT),
         ("text-anchor", _ANCHOR),
     ):
-        found = pattern.search(style)
-        if found is not None:
-            text.set(attribute, found[1])
+        match = pattern.search(style)
+        if match is not None:
+            text.set(attribute, match[1])
     fill = _FILL.search(style)
     text.set("style", f"fill: {fill[1] if fill is not None else INK}")
     if text.get("transform", "").startswith("rotate(-0 "):

@@ -106,7 +106,9 @@ class Column(Generic[Row]):
         digits = self.digits[where]
         if not isinstance(digits, int):
             digits = digits([value for value in values if isinstance(value, Estimate)])
-        return [Quantity(one, digits) if isinstance(one, Estimate) else one for one in values]
+        return [
+            Quantity(value, digits) if isinstance(value, Estimate) else value for value in values
+        ]
 
 
 @dataclass(frozen=True)
@@ -329,21 +331,24 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
     return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT_DIFFERENCE)
 
 
-def _side(one: Difference, value: float) -> str:
+def _side(difference: Difference, value: float) -> str:
     """Return the value of a side, with the digits and the unit of both."""
-    factor, unit = people_unit(one.unit)
-    digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
+    factor, unit = people_unit(difference.unit)
+    digits = formats.decimals_for_values([difference.a * factor, difference.b * factor], 4)
     return formats.number(value * factor, digits) + unit
 
 
-def _difference(one: Difference) -> Quantity:
-    quantity, unit = in_people_units(one)
-    return Quantity(quantity, formats.decimals_for([quantity], most=decimals_of(one)), unit)
+def _difference(difference: Difference) -> Quantity:
+    quantity, unit = in_people_units(difference)
+    return Quantity(quantity, formats.decimals_for([quantity], most=decimals_of(difference)), unit)
 
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:
     """Return the joints that differ, the largest difference first."""
-    known = {(one.place, one.quantity): _difference(one) for one in comparison.differences}
+    known = {
+        (difference.place, difference.quantity): _difference(difference)
+        for difference in comparison.differences
+    }
     columns: list[Column[NamedJoint]] = [
         Column(None, "joint", lambda one: one.name, kind="word"),
         *(
@@ -361,8 +366,8 @@ def waveform_table(comparison: Comparison) -> Table[Waveform]:
     phase = "gait phase" if comparison.commanded else "phase"
     most, rms = "largest ° (95 %, by itself)", "RMS of B - A °"
 
-    def at(one: Waveform) -> float:
-        return math.degrees(one.largest_at_rad)
+    def at(waveform: Waveform) -> float:
+        return math.degrees(waveform.largest_at_rad)
 
     columns: list[Column[Waveform]] = [
         Column("mean cycle of", "joint", lambda one: one.name, kind="word"),

@@ -58,14 +58,14 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)
     yield from _dead_bands(analysis)
-    for one in analysis.artefacts:
-        spans = [f"{start:.2f} to {stop:.2f} s" for start, stop in one.spans_s[:_SPANS]]
-        more = len(one.spans_s) - _SPANS
+    for artefact in analysis.artefacts:
+        spans = [f"{start:.2f} to {stop:.2f} s" for start, stop in artefact.spans_s[:_SPANS]]
+        more = len(artefact.spans_s) - _SPANS
         times = ", ".join(spans) + (f" and {more} more" if more > 0 else "")
-        note = f" ({one.note})" if one.note else ""
-        where = f"{one.quantity} on {one.topic}" if one.topic else one.quantity
-        about = f"{plain(one.joint)}, {where}: {one.flag}{note}"
-        yield f"{_ABOUT[one.about]}: {about}{': ' if times else ''}{times}"
+        note = f" ({artefact.note})" if artefact.note else ""
+        where = f"{artefact.quantity} on {artefact.topic}" if artefact.topic else artefact.quantity
+        about = f"{plain(artefact.joint)}, {where}: {artefact.flag}{note}"
+        yield f"{_ABOUT[artefact.about]}: {about}{': ' if times else ''}{times}"
 
 
 def _dead_bands(analysis: Analysis) -> Iterator[str]:
@@ -141,9 +141,13 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
         f"the strongest is {strongest.source} on {strongest.target}, "
         f"K = {formats.estimate(strongest.K, ' 1/s')}."
     )
-    couplings = [f"{one.source} on {one.target} {formats.estimate(one.K)}" for one in chain.links]
+    couplings = [
+        f"{link.source} on {link.target} {formats.estimate(link.K)}" for link in chain.links
+    ]
     yield f"K [1/s]: {'; '.join(couplings)}."
-    if fed := [one for one in chain.oscillators if one.feedback.value is not None]:
+    if fed := [
+        oscillator for oscillator in chain.oscillators if oscillator.feedback.value is not None
+    ]:
         values = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
         yield f"Feedback of each servo's own angle [1/s]: {values}."
     yield f"Method: {chain.why}, {chain.duration_s:.3g} s of phases."
@@ -377,7 +381,7 @@ def contact_lines(contact: GroundContact | None) -> Iterator[str]:
     if contact is None:
         return
     links = sorted(contact.links, key=lambda one: one.share.value or 0.0)
-    mean = sum(one.share.value or 0.0 for one in links) / len(links)
+    mean = sum(link.share.value or 0.0 for link in links) / len(links)
     if mean > _LIFTED:
         return
     least, most = (f"{_percent(one.share)} ({one.link})" for one in (links[0], links[-1]))

@@ -46,25 +46,25 @@ _MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known"
 """Beginnings of warnings that every run of a multisine has, since it is no gait."""
 
 
-def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint]:
+def best_linear_table(joints: Sequence[BestLinearJoint]) -> Table[BestLinearJoint]:
     """Return best linear approximations in short: band, bandwidth, delay, noise, distortion."""
 
-    def noise(one: BestLinearJoint) -> Estimate:
-        gain = math.hypot(*one.response.gain)
-        known = one.noise_sd is not None and gain > 0
-        return Estimate(100 * math.hypot(*one.noise_sd or ()) / gain if known else None)
+    def noise(joint: BestLinearJoint) -> Estimate:
+        gain = math.hypot(*joint.response.gain)
+        known = joint.noise_sd is not None and gain > 0
+        return Estimate(100 * math.hypot(*joint.noise_sd or ()) / gain if known else None)
 
     def share(name: str, spare: int = 0) -> Column[BestLinearJoint]:
-        def percent(one: BestLinearJoint) -> Estimate:
-            return scaled(getattr(one, name), 100.0)
+        def percent(joint: BestLinearJoint) -> Estimate:
+            return scaled(getattr(joint, name), 100.0)
 
         return Column(f"{name} % (95 %)", f"{name} [%]", percent, typical(2, 3), spare=spare)
 
-    def lowest(one: BestLinearJoint) -> Estimate:
-        return Estimate(one.response.gain[0], one.response.gain_ci95[0])
+    def lowest(joint: BestLinearJoint) -> Estimate:
+        return Estimate(joint.response.gain[0], joint.response.gain_ci95[0])
 
-    def delay_ms(one: BestLinearJoint) -> Estimate:
-        return scaled(one.response.delay_s, 1e3)
+    def delay_ms(joint: BestLinearJoint) -> Estimate:
+        return scaled(joint.response.delay_s, 1e3)
 
     columns: list[Column[BestLinearJoint]] = [
         Column("joint", "joint", lambda one: one.response.joint, kind="word"),
@@ -86,7 +86,7 @@ def best_linear_table(found: Sequence[BestLinearJoint]) -> Table[BestLinearJoint
         "odd [%]": "response at odd lines that the command leaves out, over that at its own",
         "even [%]": "the same at even lines",
     }
-    return Table(columns, found, about=about)
+    return Table(columns, joints, about=about)
 
 
 def render_comparison(
@@ -96,7 +96,7 @@ def render_comparison(
     sheet = Sheet(width, color=color)
     sheet.print(f"{comparison.answer}.", "bold")
     for side, sessions in (("A", comparison.a), ("B", comparison.b)):
-        names = ", ".join(plain(Path(one.path).name) for one in sessions)
+        names = ", ".join(plain(Path(session.path).name) for session in sessions)
         sheet.print(f"{side}: {names}")
     if comparison.partial is not None:
         sheet.print(f"Partial: {comparison.partial}")
@@ -307,7 +307,7 @@ def _reversal_method(reversal: Reversal | None) -> str:
     )
 
 
-def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
+def travel_table(connection: BodyConnection) -> Table[PredictedTravel]:
     """Return the travel of each session, predicted from the others and measured."""
 
     def column(
@@ -331,11 +331,11 @@ def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
         column("turn", "°", lambda one: formats.degrees(one.turn_rad)),
         column("measured turn", "°", lambda one: formats.degrees(one.measured_turn_rad)),
     ]
-    return Table(columns, found.predicted)
+    return Table(columns, connection.predicted)
 
 
-def refusals(found: BodyConnection) -> Iterator[str]:
+def refusals(connection: BodyConnection) -> Iterator[str]:
     """Yield a sentence on each session that is not predicted."""
-    for one in found.predicted:
+    for one in connection.predicted:
         if one.why is not None:
             yield f"{formats.filename(one.path)} is not predicted: {one.why}."

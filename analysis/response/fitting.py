@@ -150,12 +150,14 @@ def fit_gait(
     if not commands:
         return _responses_only(responses, found.rhythms[0])
     channels, amplitudes = _select(commands, responses, found, warn)
-    rhythms = [one for one, group in zip(found.rhythms, channels, strict=True) if group.driven]
+    rhythms = [
+        rhythm for rhythm, group in zip(found.rhythms, channels, strict=True) if group.driven
+    ]
     channels = [group for group in channels if group.driven]
     if not channels:
         warn(Lacking("no gait: no joint has enough commands at the frequency that they share"))
         return None
-    fits = _fit_groups(channels, [one.omega for one in rhythms], duration_s)
+    fits = _fit_groups(channels, [rhythm.omega for rhythm in rhythms], duration_s)
     _warn_groups(found, fits, duration_s, warn)
     groups = [
         _group_fit(group, fit, amplitudes, warn) for group, fit in zip(channels, fits, strict=True)
@@ -165,40 +167,40 @@ def fit_gait(
 
 def _swinging(commands: Mapping[str, Series], warn: Warn) -> Mapping[str, Series]:
     """Return the commands without those that turn without end beside others."""
-    turning = turning_beside_others({name: one.values for name, one in commands.items()})
+    turning = turning_beside_others({name: command.values for name, command in commands.items()})
     if turning:
         turn = "turns" if len(turning) == 1 else "turn"
         warn(Note(f"{', '.join(turning)} {turn} without end: gain and lag are null"))
-    return {name: one for name, one in commands.items() if name not in turning}
+    return {name: command for name, command in commands.items() if name not in turning}
 
 
 def _warn_no_gait(
-    known: Sequence[Series], found: Groups | None, kind: str, duration_s: float, warn: Warn
+    series: Sequence[Series], groups: Groups | None, kind: str, duration_s: float, warn: Warn
 ) -> None:
     """Say why there is no gait; the answer begins with it where the record is to blame."""
-    unusable = too_seldom(known) or few_cycles(known, duration_s)
-    text = why_no_gait(known, found, kind, duration_s, unusable)
+    unusable = too_seldom(series) or few_cycles(series, duration_s)
+    text = why_no_gait(series, groups, kind, duration_s, unusable)
     warn(Lacking(text) if unusable is None else Refusal(text))
 
 
 def _select(
-    commands: Mapping[str, Series], responses: Mapping[str, Series], found: Groups, warn: Warn
+    commands: Mapping[str, Series], responses: Mapping[str, Series], groups: Groups, warn: Warn
 ) -> tuple[list[_Channels], dict[str, float]]:
     """Return the channels of each group's driven joints, and the amplitudes of all commands."""
-    several = len(found.rhythms) > 1
-    least = max(MIN_SAMPLES, 2 * HARMONICS * len(found.rhythms) + 2 if several else 0)
-    group_of = {name: k for k, one in enumerate(found.rhythms) for name in one.names}
+    several = len(groups.rhythms) > 1
+    least = max(MIN_SAMPLES, 2 * HARMONICS * len(groups.rhythms) + 2 if several else 0)
+    group_of = {name: k for k, rhythm in enumerate(groups.rhythms) for name in rhythm.names}
 
-    def enough(name: str, one: Series) -> bool:
-        return _usable(one, found.rhythms[group_of.get(name, 0)].omega, least)
+    def enough(name: str, series: Series) -> bool:
+        return _usable(series, groups.rhythms[group_of.get(name, 0)].omega, least)
 
-    usable = {name: one for name, one in commands.items() if enough(name, one)}
+    usable = {name: command for name, command in commands.items() if enough(name, command)}
     amplitudes = dict.fromkeys(usable, 0.0)
-    strays = set(found.astray)
+    strays = set(groups.astray)
     followers: set[str] = set()
     silent: list[str] = []
     channels: list[_Channels] = []
-    for rhythm in found.rhythms:
+    for rhythm in groups.rhythms:
         moving = [one for name, one in usable.items() if name in rhythm.names]
         if not moving:
             channels.append(_Channels((), (), []))
@@ -217,7 +219,7 @@ def _select(
         answered = tuple(n for n in moved if n in responses and enough(n, responses[n]))
         silent += [name for name in moved if name in responses and name not in answered]
         channels.append(_Channels(moved, answered, chosen + [responses[n] for n in answered]))
-    unresolved = {name for close in found.unresolved for name in close.left}
+    unresolved = {name for close in groups.unresolved for name in close.left}
     _warn_undriven(
         held=[name for name in usable if name not in strays | followers | unresolved],
         astray=[name for name in usable if name in strays],
@@ -396,7 +398,7 @@ def _within(value: Estimate, unit: str, scale: float = 1.0) -> str:
 
 
 def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:
-    usable = [one for one in responses.values() if _usable(one, rhythm.omega)]
+    usable = [response for response in responses.values() if _usable(response, rhythm.omega)]
     moving = [one for one in usable if np.ptp(one.values) > 0]
     fit = fit_shared(moving, rhythm.omega, allowed_model(moving, rhythm.omega))
     variance, dof = omega_variance(fit, residual_noise(moving, fit))
@@ -417,7 +419,11 @@ def fit_at_period(
         The fit; None, with a warning, where the window is too short or sampled too seldom for it.
     """
     omega = 2 * np.pi / period_s
-    moving = [one for one in responses.values() if _usable(one, omega) and np.ptp(one.values) > 0]
+    moving = [
+        response
+        for response in responses.values()
+        if _usable(response, omega) and np.ptp(response.values) > 0
+    ]
     if not moving or duration_s < MIN_CYCLES * period_s:
         warn(
             Lacking(
@@ -436,12 +442,12 @@ def fit_at_period(
     return GaitFit(fit, 0.0, dof, (), (), None, {})
 
 
-def _usable(one: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
+def _usable(series: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
     """Enough samples, often enough, for long enough."""
-    if one.count <= least:
+    if series.count <= least:
         return False
-    cycles = omega * float(one.t_s[-1] - one.t_s[0] + one.period_s) / (2 * np.pi)
-    return one.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
+    cycles = omega * float(series.t_s[-1] - series.t_s[0] + series.period_s) / (2 * np.pi)
+    return series.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
 
 
 def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Noise:
@@ -461,9 +467,11 @@ def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], w
             warn(Note(text) if joints is held else text)
 
 
-def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, warn: Warn) -> None:
+def _warn_groups(
+    groups: Groups, fits: Sequence[HarmonicFit], duration_s: float, warn: Warn
+) -> None:
     """Report what limits an analysis by groups."""
-    for close in found.unresolved:
+    for close in groups.unresolved:
         low, high = distinct(close.low_hz, close.high_hz)
         need_s = RESOLUTION / (close.high_hz - close.low_hz)
         nulls = f"gain and lag of {', '.join(close.left)} are null"

@@ -71,7 +71,7 @@ def frequency_responses(
     Returns:
         One result a joint, in the order of the commands, of the first :data:`MOST_JOINTS`.
     """
-    moving = (name for name, one in commands.items() if moves(one.values))
+    moving = (name for name, command in commands.items() if moves(command.values))
     answered = (name for name in moving if name in responses and responses[name].count)
     known = list(islice(answered, MOST_JOINTS))
     if next(answered, None) is not None:
@@ -131,7 +131,7 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
     if tones.size:
         middle = (start + stop) / 2
         for limits in (start, stop), (start, middle), (middle, stop):
-            command, response, *reference = (one.between(*limits) for one in series)
+            command, response, *reference = (series.between(*limits) for series in series)
             enough = response.count > 2 * tones.size + _SPARE
             yield (
                 sound_lines(tone_response(command, response, tones, looped=bool(reference)))
@@ -139,11 +139,11 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
                 else None
             )
         return
-    if min(one.count for one in series) <= _SPARE:
+    if min(series.count for series in series) <= _SPARE:
         yield from (None, None, None)
         return
-    t_s, step = even_times(start, stop, max(one.period_s for one in series))
-    even = [resampled(one, t_s) for one in series]
+    t_s, step = even_times(start, stop, max(series.period_s for series in series))
+    even = [resampled(series, t_s) for series in series]
     whole = _of_band(even, step)
     yield None if whole is None else sound_lines(whole)
     half = t_s.size // 2
@@ -221,18 +221,18 @@ def _log_spaced(low: float, high: float, count: int) -> FloatArray:
 
 def _unbroken(series: Sequence[Series]) -> list[Series]:
     """Return the longest stretch that all have without a long gap; short ones are bridged."""
-    start = max(one.t_s[0] for one in series)
-    stop = min(one.t_s[-1] for one in series)
+    start = max(series.t_s[0] for series in series)
+    stop = min(series.t_s[-1] for series in series)
     breaks = [(stop, start)] if start > stop else []
     for one in series:
         step = np.diff(one.t_s)
         long = np.flatnonzero(step > _LONG_GAP * (stop - start))
         breaks.extend(zip(one.t_s[long].tolist(), one.t_s[long + 1].tolist(), strict=True))
     starts = [start, *(after for _, after in breaks)]
-    stops = [min([stop, *(before for before, _ in breaks if before >= one)]) for one in starts]
+    stops = [min([stop, *(before for before, _ in breaks if before >= start)]) for start in starts]
     k = int(np.argmax(np.subtract(stops, starts)))
     limits = starts[k], stops[k] + 1e-9
-    return [one.between(*limits) for one in series]
+    return [series.between(*limits) for series in series]
 
 
 def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]:

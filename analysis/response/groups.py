@@ -145,7 +145,7 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     common = find_rhythm(series, duration_s)
     if common is None:
         return None
-    moving = [one for one in series if one.name in common.names]
+    moving = [series for series in series if series.name in common.names]
     size = np.sqrt(common.fit.total / common.fit.count)
     lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
     # Whether the common rhythm is each channel's own and not a subharmonic of it.
@@ -176,8 +176,10 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     rhythms = _with_compound(rhythms, active, rest, duration_s)
     rhythms.sort(key=lambda one: (-len(one.names), -float(one.fit.total.sum()), one.omega))
     total = float(common.fit.total.sum())
-    undecided = [one.rhythm for one in tones if one.series.name in left]
-    known = sum(float((one.fit.total - one.fit.rss).sum()) for one in (*rhythms, *undecided))
+    undecided = [tone.rhythm for tone in tones if tone.series.name in left]
+    known = sum(
+        float((rhythm.fit.total - rhythm.fit.rss).sum()) for rhythm in (*rhythms, *undecided)
+    )
     grouped = {name for rhythm in rhythms for name in rhythm.names}
     astray = tuple(one.name for one in active if one.name not in grouped | left)
     return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
@@ -228,20 +230,20 @@ def _one_rhythm(cluster: Sequence[_Tone], same: float) -> tuple[Rhythm | None, U
 
 def _shared(tones: Sequence[_Tone]) -> Rhythm | None:
     """One rhythm of several channels, in their order in the chain."""
-    omega = float(np.mean([one.rhythm.omega for one in tones]))
-    return refine([one.series for one in tones], omega)
+    omega = float(np.mean([tone.rhythm.omega for tone in tones]))
+    return refine([tone.series for tone in tones], omega)
 
 
 def _with_compound(
     rhythms: Sequence[Rhythm], active: Sequence[Series], rest: Sequence[Series], duration_s: float
 ) -> list[Rhythm]:
     """Fit the groups with each other's tones; a channel of several goes where its largest is."""
-    omegas = [one.omega for one in rhythms]
-    names = [set(one.names) for one in rhythms]
+    omegas = [rhythm.omega for rhythm in rhythms]
+    names = [set(rhythm.names) for rhythm in rhythms]
 
     def fitted(series: Sequence[Series], group: int) -> HarmonicFit | None:
         model = group_model(series, omegas, group, duration_s)
-        enough = all(one.count > model.size + 1 for one in series)
+        enough = all(series.count > model.size + 1 for series in series)
         return fit_at(series, omegas[group], model) if enough else None
 
     for one in rest:
@@ -255,7 +257,7 @@ def _with_compound(
         if fit is None or (len(rhythms) == 1 and len(members) == len(rhythm.names)):
             result.append(rhythm)
         else:
-            result.append(Rhythm(tuple(one.name for one in members), fit))
+            result.append(Rhythm(tuple(member.name for member in members), fit))
     return result
 
 
@@ -355,7 +357,9 @@ def with_mixed_lines(
             break
         line = candidates[best]
         model = replace(model, lines=(*model.lines, line))
-        candidates = [one for one in candidates if abs(one - line) > _APART * bin_rad_s]
+        candidates = [
+            candidate for candidate in candidates if abs(candidate - line) > _APART * bin_rad_s
+        ]
     return model
 
 
@@ -371,24 +375,24 @@ def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
         does not resolve from it.
     """
     near = RESOLUTION * 2 * np.pi / duration_s
-    found: list[MixedTone] = []
+    tones: list[MixedTone] = []
     for group, omega in enumerate(omegas):
         for factors in _combinations(len(omegas), MIXING_ORDER):
             tone = sum(factor * omegas[k] for k, factor in factors.items())
             if factors != {group: 1} and abs(abs(tone) - omega) < near:
                 sign = 1 if tone > 0 else -1
-                found.append(MixedTone(group, {k: sign * one for k, one in factors.items()}))
+                tones.append(MixedTone(group, {k: sign * factor for k, factor in factors.items()}))
                 break
-    return found
+    return tones
 
 
 def _highest(series: Sequence[Series]) -> float:
     """Highest frequency that the slowest channel's sampling rate allows [rad/s]."""
-    return NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
+    return NYQUIST_SHARE * 2 * np.pi / max(series.period_s for series in series)
 
 
 def _most_lines(series: Sequence[Series]) -> int:
-    return min(one.count for one in series) // _SAMPLES_PER_LINE
+    return min(series.count for series in series) // _SAMPLES_PER_LINE
 
 
 def _candidates(

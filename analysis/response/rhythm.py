@@ -75,7 +75,7 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [one for one in series if one.count > MIN_SAMPLES and moves(one.values)]
+    moving = [series for series in series if series.count > MIN_SAMPLES and moves(series.values)]
     if not moving or duration_s <= 0:
         return None
     scouts = liveliest(moving)
@@ -102,7 +102,7 @@ def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> Har
     Returns:
         One to ``HARMONICS`` harmonics.
     """
-    slowest = max(one.period_s for one in series)
+    slowest = max(series.period_s for series in series)
     highest = int(NYQUIST_SHARE * 2 * np.pi / (slowest * omega)) if slowest > 0 else 1
     return HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)), trend=trend)
 
@@ -170,7 +170,7 @@ def liveliest(series: Sequence[Series]) -> list[Series]:
 def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
     """Return the rhythm of the scouts near a frequency, and what it explains of all channels."""
     model = allowed_model(series, omega)
-    if any(one.count <= model.size + 1 for one in series):
+    if any(series.count <= model.size + 1 for series in series):
         return None
     try:
         fit = fit_at(scouts, omega, model)
@@ -182,7 +182,7 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
             fit = fit_at(series, fit.omega, model)
     except DataError:
         return None
-    return Rhythm(tuple(one.name for one in series), fit)
+    return Rhythm(tuple(series.name for series in series), fit)
 
 
 def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | None:
@@ -201,8 +201,8 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     length = 1 << int(np.ceil(np.log2(_PADDING * count)))
     power = np.zeros(length // 2 + 1)
     taper = np.hanning(count)
-    for one in scouts:
-        values = one.at(grid)
+    for scout in scouts:
+        values = scout.at(grid)
         power += np.abs(np.fft.rfft((values - values.mean()) * taper, length)) ** 2
     frequency = np.fft.rfftfreq(length, step)
     # Half a cycle below the limit: the peak of a rhythm of just three cycles must be found.

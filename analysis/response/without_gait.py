@@ -141,7 +141,7 @@ def too_seldom_in_words(seen: TooSeldom, kind: str) -> str:
 
 
 def why_no_gait(
-    known: Sequence[Series],
+    series: Sequence[Series],
     rhythms: Groups | None,
     kind: str,
     duration_s: float,
@@ -150,7 +150,7 @@ def why_no_gait(
     """Say why channels hold no gait.
 
     Args:
-        known: All channels.
+        series: All channels.
         rhythms: The best rhythms; None without any.
         kind: ``commands`` or ``responses``.
         duration_s: Length of the stretch [s].
@@ -159,7 +159,7 @@ def why_no_gait(
     Returns:
         A sentence without its full stop.
     """
-    if not any(moves(one.values) for one in known):
+    if not any(moves(one.values) for one in series):
         return f"no gait: the {kind} never move; {_NULLS}"
     if isinstance(unusable, TooSeldom):
         return f"no gait: {too_seldom_in_words(unusable, kind)}; {_NULLS}"
@@ -170,7 +170,7 @@ def why_no_gait(
             f"no gait: not periodic: no rhythm of at least {MIN_CYCLES:g} cycles can be told from "
             f"the {kind} in {duration_s:.3g} s; {_NULLS}"
         )
-    frequencies = ", ".join(f"{one.omega / (2 * np.pi):.3g} Hz" for one in rhythms.rhythms)
+    frequencies = ", ".join(f"{rhythm.omega / (2 * np.pi):.3g} Hz" for rhythm in rhythms.rhythms)
     single = len(rhythms.rhythms) == 1
     best = f"rhythm ({frequencies}) explains" if single else f"rhythms ({frequencies}) explain"
     share = percent(max(rhythms.explained, 0.0), MIN_EXPLAINED)
@@ -182,4 +182,4 @@ def why_no_gait(
 
 
 def _moving(series: Sequence[Series]) -> list[Series]:
-    return [one for one in series if one.count > MIN_SAMPLES and moves(one.values)]
+    return [series for series in series if series.count > MIN_SAMPLES and moves(series.values)]

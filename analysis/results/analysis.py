@@ -291,7 +291,7 @@ class Analysis(PresentedResult):
         interval in ``lag_ci95``.
         """
         return dataclasses.asdict(self) | {
-            "gait": _record(self.gait) | {"groups": [_record(one) for one in self.gait.groups]},
+            "gait": _record(self.gait) | {"groups": [_record(group) for group in self.gait.groups]},
             "joints": [_record(joint) for joint in self.joints],
             "gaits": [
                 _record(gait) | {"joints": [_record(joint) for joint in gait.joints]}
@@ -306,7 +306,10 @@ class Analysis(PresentedResult):
             "frequency_response": [_record(one) for one in self.frequency_response],
             "tracking": [_record(joint) for joint in self.tracking],
             "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
-            "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
+            "artefacts": [
+                dataclasses.asdict(artefact) | {"about": artefact.about}
+                for artefact in self.artefacts
+            ],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
@@ -352,20 +355,20 @@ def _motion_dict(motion: FreeMotion) -> dict[str, Any]:
         | {"direction": wave.direction, "local": [_record(part) for part in wave.local]}
         for wave in motion.waves
     ]
-    return {"joints": [_record(one) for one in motion.joints], "waves": waves}
+    return {"joints": [_record(joint) for joint in motion.joints], "waves": waves}
 
 
 def _shape_dict(shape: BodyShape) -> dict[str, Any]:
     planes = [
-        dataclasses.asdict(one)
-        | {"modes": [_record(mode) for mode in one.modes], "serpenoid": _record(one.serpenoid)}
-        for one in shape.planes
+        dataclasses.asdict(plane)
+        | {"modes": [_record(mode) for mode in plane.modes], "serpenoid": _record(plane.serpenoid)}
+        for plane in shape.planes
     ]
     return {"planes": planes, "travel": None if shape.travel is None else _record(shape.travel)}
 
 
 def _contact_dict(contact: GroundContact) -> dict[str, Any]:
-    return dataclasses.asdict(contact) | {"links": [_record(one) for one in contact.links]}
+    return dataclasses.asdict(contact) | {"links": [_record(link) for link in contact.links]}
 
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:

@@ -160,17 +160,21 @@ class Remarks:
     def leading(self) -> tuple[str, ...]:
         """What the answer begins with; refusals alone if there are any."""
         kind = Refusal if self.refused else Leading
-        return tuple(str(one) for one in self._sentences.values() if isinstance(one, kind))
+        return tuple(
+            str(sentence) for sentence in self._sentences.values() if isinstance(sentence, kind)
+        )
 
     @property
     def refused(self) -> bool:
         """Whether there is a :class:`Refusal`."""
-        return any(isinstance(one, Refusal) for one in self._sentences.values())
+        return any(isinstance(sentence, Refusal) for sentence in self._sentences.values())
 
     @property
     def notes(self) -> tuple[str, ...]:
         """The notes, in the order in which they came."""
-        return tuple(str(one) for one in self._sentences.values() if isinstance(one, Note))
+        return tuple(
+            str(sentence) for sentence in self._sentences.values() if isinstance(sentence, Note)
+        )
 
 
 class Verdict(StrEnum):
@@ -414,10 +418,10 @@ def flags_by_joint(artefacts: Iterable[Artefact]) -> dict[str, list[str]]:
         Joint name to flags, each once.
     """
     found: dict[str, list[str]] = {}
-    for one in artefacts:
-        flags = found.setdefault(one.joint, [])
-        if one.flag not in flags:
-            flags.append(one.flag)
+    for artefact in artefacts:
+        flags = found.setdefault(artefact.joint, [])
+        if artefact.flag not in flags:
+            flags.append(artefact.flag)
     return found
 
 

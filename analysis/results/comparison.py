@@ -186,7 +186,9 @@ class Comparison(PresentedResult):
     @property
     def commanded(self) -> bool:
         """Whether the sessions have commands, and so gains and lags."""
-        return not any(one.quantity in ("amplitude", "frequency") for one in self.differences)
+        return not any(
+            difference.quantity in ("amplitude", "frequency") for difference in self.differences
+        )
 
 
 @dataclass(frozen=True)
@@ -276,7 +278,7 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         Without its full stop, intervals in square brackets.
     """
     if named:
-        first = next(one for one in modules if one.name == named[0])
+        first = next(module for module in modules if module.name == named[0])
         clear = {kind: e for kind, e in first.relative.items() if leaves_out_zero(e.ci95)}
         shown = (clear or first.relative).items()
         own = ", ".join(f"{_words(kind)} {formats.percent(one)}" for kind, one in shown)
@@ -289,7 +291,7 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         )
     bounds: list[str] = []
     for kind in modules[0].relative:
-        ends = [abs(end) for one in modules for end in one.relative[kind].ci95 or (math.inf,)]
+        ends = [abs(end) for module in modules for end in module.relative[kind].ci95 or (math.inf,)]
         if max(ends) < 1:  # more than that is no bound
             bounds.append(f"{100 * max(ends):.2g} % in {_words(kind)}")
     bound = f": none by more than {', '.join(bounds)}" if bounds else ", nor any bound on it"
@@ -303,8 +305,9 @@ def null_model_text(result: NullModelResult) -> list[str]:
         The answer first, the parameters last.
     """
     shared = ", ".join(
-        f"{_words(one.name)} {formats.estimate(one.fitted)} {one.unit} (model {one.assumed:.4g})"
-        for one in result.parameters
+        f"{_words(parameter.name)} {formats.estimate(parameter.fitted)} {parameter.unit} "
+        f"(model {parameter.assumed:.4g})"
+        for parameter in result.parameters
     )
     return [
         f"Modules, {result.condition}: {result.answer}.",

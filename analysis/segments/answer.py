@@ -134,7 +134,9 @@ def _named(facts: Facts) -> str:
         clauses.insert(0, plain(facts.judgement.naming))
     judged = facts.judgement
     differences = (*judged.changes, *judged.extra, *_apart(facts))
-    clauses += [clause_of(each, plain(each.joint)) for each in differences[:NAMED]]
+    clauses += [
+        clause_of(difference, plain(difference.joint)) for difference in differences[:NAMED]
+    ]
     if judged.rests:
         clauses.append(rests_in_words(judged.rests))
     if low := _low_gains(facts):
@@ -198,9 +200,9 @@ def _left_out(facts: Facts) -> str:
 def _scales(facts: Facts) -> str:
     """Say which joints' velocities have another scale than their positions; empty for none."""
     clauses = [
-        f"{plain(each.joint)}'s velocity is {each.note}"
-        for each in facts.artefacts
-        if (each.quantity, each.flag) == ("velocity", "scale_mismatch") and each.note
+        f"{plain(artefact.joint)}'s velocity is {artefact.note}"
+        for artefact in facts.artefacts
+        if (artefact.quantity, artefact.flag) == ("velocity", "scale_mismatch") and artefact.note
     ]
     more = f" and {len(clauses) - NAMED} more" if len(clauses) > NAMED else ""
     return f"{'; '.join(clauses[:NAMED])}{more}." if clauses else ""
@@ -235,7 +237,7 @@ def _boundary(facts: Facts) -> str:
     return f"the boundary or {', '.join(pairs)}: {what_decides}"
 
 
-def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
+def _rest(facts: Facts, results: Sequence[JointResult]) -> tuple[Verdict, str, str]:
     """Verdict, sentence and detail on the joints that are not named."""
     judged = facts.judgement
     named = bool(facts.not_following or judged.changes or judged.extra or judged.rests)
@@ -244,19 +246,19 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
     if facts.motion is not None or facts.gait.frequency_hz.value is None:
         about = "no command" if facts.motion is not None else "no gait"
         return Verdict.NOTHING, _without_gait(facts), _why_not(facts, about)
-    if not known:
+    if not results:
         lead = "No joint could be compared with its command."
         return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
-    if len(known) == 1:
-        return _single(facts, known[0], named=named)
-    return *_compared(facts, named=named), _responding(facts, known) + _caveat(facts.joints)
+    if len(results) == 1:
+        return _single(facts, results[0], named=named)
+    return *_compared(facts, named=named), _responding(facts, results) + _caveat(facts.joints)
 
 
 def _without_gait(facts: Facts) -> str:
     """Return the sentence on a session without commands or without a gait."""
     if facts.motion is not None:
         return _motion(facts, facts.motion)
-    if made := [one for one in facts.warnings if one.startswith("times made from fps")]:
+    if made := [warning for warning in facts.warnings if warning.startswith("times made from fps")]:
         why = f"Not periodic, {made[0].split(':')[0]}"
         return _tracked(why, facts.tracking) or f"{why}: no gain and no lag to compare."
     if facts.frequency_response:
@@ -291,13 +293,13 @@ def _motion(facts: Facts, motion: FreeMotion) -> str:
     whole = [wave for wave in motion.waves if wave.standing or wave.direction != "undecided"]
     if not whole or len(motion.joints) <= NAMED:
         sizes = [
-            f"{plain(one.name)} {formats.estimate(formats.degrees(one.amplitude_rad), '°')}"
-            for one in motion.joints[:NAMED]
+            f"{plain(joint.name)} {formats.estimate(formats.degrees(joint.amplitude_rad), '°')}"
+            for joint in motion.joints[:NAMED]
         ]
         more = f" and {len(motion.joints) - NAMED} more" if len(motion.joints) > NAMED else ""
         lead = f"{lead} of {', '.join(sizes)}{more}"
     else:
-        sizes = [math.degrees(one.amplitude_rad.value or 0.0) for one in motion.joints]
+        sizes = [math.degrees(joint.amplitude_rad.value or 0.0) for joint in motion.joints]
         lead = f"{lead} of {min(sizes):.3g}° to {max(sizes):.3g}°"
     return "; ".join((lead, *(_wave(one) for one in whole))) + "."
 
@@ -331,17 +333,17 @@ def _size_of(number: Estimate) -> float:
     return number.value or 0.0
 
 
-def _swept(found: Sequence[JointFrequencyResponse], tracking: Sequence[JointTracking]) -> str:
+def _swept(responses: Sequence[JointFrequencyResponse], tracking: Sequence[JointTracking]) -> str:
     """Return the sentence on frequency responses."""
-    kinds = " and ".join(sorted({one.excitation for one in found}))
-    band = _range([f for one in found for f in (one.frequency_hz[0], one.frequency_hz[-1])])
-    text = f"No gait: the commands are of the kind {kinds}; frequency response of {len(found)} "
-    text += f"joint{'s' if len(found) > 1 else ''} from {band} Hz"
-    edges = [one.bandwidth_hz for one in found if one.bandwidth_hz is not None]
+    kinds = " and ".join(sorted({one.excitation for one in responses}))
+    band = _range([f for one in responses for f in (one.frequency_hz[0], one.frequency_hz[-1])])
+    text = f"No gait: the commands are of the kind {kinds}; frequency response of {len(responses)} "
+    text += f"joint{'s' if len(responses) > 1 else ''} from {band} Hz"
+    edges = [one.bandwidth_hz for one in responses if one.bandwidth_hz is not None]
     lags = [1e3 * (joint.lag_s.value or 0.0) for joint in tracking if joint.explained >= FOLLOWS]
     text += f", -3 dB at {_range(edges)} Hz" if edges else ""
     text += f", lag {_range(lags)} ms" if lags else ""
-    shared = len(found) > 1 and len(found[0].shares_command) == len(found) - 1
+    shared = len(responses) > 1 and len(responses[0].shares_command) == len(responses) - 1
     return text + (". All joints share one command: it is the response to that." if shared else ".")
 
 
@@ -398,7 +400,7 @@ def _shapes(facts: Facts) -> str:
             ]
             shaped = [each for each in own if each.kind != "each"]
             ends = [each for each in shaped if each.kind == "ends"]
-            clauses += [_shape(each, word) for each in (ends or shaped or own)[:1]]
+            clauses += [_shape(end, word) for end in (ends or shaped or own)[:1]]
     boundary = _boundary(facts)
     return f"{'; '.join(clauses)} ({boundary})" if boundary else "; ".join(clauses)
 
@@ -435,13 +437,13 @@ def _joints_word(facts: Facts, plane: str, group: int) -> str:
     return f"{word} at {formats.number(frequency.value, 3)} Hz"
 
 
-def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
+def _responding(facts: Facts, results: Sequence[JointResult]) -> str:
     """How many joints respond, to which gait, and the range of their lags."""
     if facts.gait.frequency_hz.value is None:
         return _why_not(facts, "no gait")
     frequency = formats.gait_frequency(facts.gait)
     silent = {each.joint for each in facts.not_following}
-    responding = [joint for joint in known if joint.name not in silent]
+    responding = [joint for joint in results if joint.name not in silent]
     text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"
     if lags := [(lag, j.name) for j in responding if (lag := j.lag_rad.value) is not None]:
         first, last = (of(lags, key=lambda pair: pair[0]) for of in (min, max))
@@ -467,6 +469,8 @@ def _why_not(facts: Facts, lacking: str) -> str:
     """Return the warning that says what is lacking, or else speaks of a gait, or the first."""
     if not facts.warnings:
         return "The result gives no reason."
-    verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]
+    verdict = [
+        warning for warning in facts.warnings if lacking in warning and "held still" not in warning
+    ]
     about = [warning for warning in facts.warnings if "gait" in warning.lower()]
     return formats.sentence((verdict or about or facts.warnings)[0])

@@ -133,10 +133,10 @@ def examine(chains: Iterable[Chain]) -> Findings:
         active[list(excluded[id(chain)])] = False
         half = float(np.var(profile.values[active])) / 2
         found = [
-            each
-            for each in contrasts(profile, active)
-            if reaches(abs(each.value), critical * each.error, profile.margin)
-            and (each.kind == "each" or each.spread**2 >= half)
+            contrast
+            for contrast in contrasts(profile, active)
+            if reaches(abs(contrast.value), critical * contrast.error, profile.margin)
+            and (contrast.kind == "each" or contrast.spread**2 >= half)
         ]
         if len(chain.names) < MIN_JOINTS:
             if found:
@@ -234,7 +234,7 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     Their errors come from the scatter between cycles, so they are outside the family of gain and
     lag; the margin is many times what noise makes of a mean.
     """
-    known = {name for name, each in chain.offsets.items() if each.size >= _MIN_CYCLES}
+    known = {name for name, offset in chain.offsets.items() if offset.size >= _MIN_CYCLES}
     index = [k for k, name in enumerate(chain.names) if name in known]
     if len(index) < MIN_JOINTS:
         return []
@@ -282,16 +282,16 @@ def _interval(value: float, half: float, quantity: str) -> tuple[float, tuple[fl
 
 
 def _stand_out(
-    chain: Chain, joint: int, quantity: str, each: Deviation, critical: float
+    chain: Chain, joint: int, quantity: str, deviation: Deviation, critical: float
 ) -> StandOut:
-    value, ci95 = _interval(each.value, critical * each.error, quantity)
+    value, ci95 = _interval(deviation.value, critical * deviation.error, quantity)
     return StandOut(chain.names[joint], chain.plane, chain.group, 0, quantity, value, ci95)
 
 
-def _shape(chain: Chain, quantity: str, each: Contrast, critical: float) -> Shape:
-    value, ci95 = _interval(each.value, critical * each.error, quantity)
-    joint = None if each.joint is None else chain.names[each.joint]
-    return Shape(each.kind, quantity, chain.plane, chain.group, value, ci95, joint)
+def _shape(chain: Chain, quantity: str, contrast: Contrast, critical: float) -> Shape:
+    value, ci95 = _interval(contrast.value, critical * contrast.error, quantity)
+    joint = None if contrast.joint is None else chain.names[contrast.joint]
+    return Shape(contrast.kind, quantity, chain.plane, chain.group, value, ci95, joint)
 
 
 def _ranked(out: Sequence[StandOut]) -> tuple[StandOut, ...]:

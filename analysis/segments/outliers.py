@@ -208,8 +208,8 @@ def _worst(profile: Profile, state: State, critical: float) -> tuple[int | None,
     for joint in np.argsort(-score).tolist():
         if score[joint] <= critical:
             break
-        one = Deviation(joint, float(value[joint]), float(error[joint]))
-        if _stands_out(profile, state, one, critical):
+        deviation = Deviation(joint, float(value[joint]), float(error[joint]))
+        if _stands_out(profile, state, deviation, critical):
             return joint, float(score[joint])
     return None, 0.0
 
@@ -244,12 +244,12 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
     return columns
 
 
-def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
+def _stands_out(profile: Profile, state: State, deviation: Deviation, critical: float) -> bool:
     """Return whether a deviation reaches the margin and exceeds the others' residuals."""
-    if not reaches(abs(one.value), critical * one.error, profile.margin):
+    if not reaches(abs(deviation.value), critical * deviation.error, profile.margin):
         return False
     others = state.active.copy()
-    others[one.joint] = False
+    others[deviation.joint] = False
     index = np.flatnonzero(others)
     rows = deviation_weights(profile, others, state.shapes)
     # Of equal scatter, a deviation has that of its weights: more at an end, where a shape leads on.
@@ -258,7 +258,7 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
     spare = index.size - 1 - len(state.shapes)
     centred = np.abs(residual - np.median(residual))
     robust = ROBUST * float(np.median(centred)) * np.sqrt(index.size / max(spare, 1))
-    size = abs(one.value) / float(reach[one.joint])
+    size = abs(deviation.value) / float(reach[deviation.joint])
     if spare < 1 or size <= FAR * robust:
         return False
     typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
@@ -267,7 +267,7 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
     if smooth and not state.shapes:
         return True
     limit = _limit(profile, spare) * scatter
-    return size > limit and _out_of_profile(profile, index, one, rows, smooth=smooth)
+    return size > limit and _out_of_profile(profile, index, deviation, rows, smooth=smooth)
 
 
 def _scatter(residual: FloatArray, rows: FloatArray, others: IntArray, spare: int) -> float:
@@ -285,7 +285,7 @@ def _limit(profile: Profile, spare: int) -> float:
 
 
 def _out_of_profile(
-    profile: Profile, others: IntArray, one: Deviation, rows: FloatArray, *, smooth: bool
+    profile: Profile, others: IntArray, deviation: Deviation, rows: FloatArray, *, smooth: bool
 ) -> bool:
     """Return whether a joint stands out of a rest that has a profile of its own.
 
@@ -294,27 +294,27 @@ def _out_of_profile(
     about the same.
     """
     reach = float(np.ptp(profile.values[others]))
-    beside = _beside_neighbours(profile, others, one.joint)
+    beside = _beside_neighbours(profile, others, deviation.joint)
     place = profile.place
     first, last = place[others].min(), place[others].max()
-    extrapolated = not first <= place[one.joint] <= last and abs(one.value) <= reach
-    if (extrapolated and not smooth) or min(each / one.value for each in beside) < LOCAL:
+    extrapolated = not first <= place[deviation.joint] <= last and abs(deviation.value) <= reach
+    if (extrapolated and not smooth) or min(each / deviation.value for each in beside) < LOCAL:
         return False
-    mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
-    if not mirror.size or mirror[0] == one.joint:
+    mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[deviation.joint])
+    if not mirror.size or mirror[0] == deviation.joint:
         return True
     partner = int(mirror[0])
     by_model = float(rows[partner] @ profile.values)
     rest = others[others != partner]
     beside = _beside_neighbours(profile, rest, partner)
-    shown = [each / one.value for each in (by_model, *beside)]
+    shown = [each / deviation.value for each in (by_model, *beside)]
     if not any(MIRRORED <= abs(share) <= 1 / MIRRORED for share in shown):
         return True
     # A shape of the body has its flanks: inside of the ends, a pair that the joints on both sides
     # don't follow is two joints.
-    inner = first < place[one.joint] < last and first < place[partner] < last
-    away = (*_beside_neighbours(profile, rest, one.joint), *beside)
-    return bool(inner) and min(each / one.value for each in away) > 1 - LOCAL
+    inner = first < place[deviation.joint] < last and first < place[partner] < last
+    away = (*_beside_neighbours(profile, rest, deviation.joint), *beside)
+    return bool(inner) and min(each / deviation.value for each in away) > 1 - LOCAL
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:

@@ -57,9 +57,9 @@ def _pooled(chains: Sequence[Chain]) -> Chain:
     squared = weights[:, np.newaxis] ** 2
     response = Response(
         unit * np.exp(weights @ logs),
-        np.sum(squared * [each.log_gain_variance for each in responses], axis=0),
-        np.sum(squared * [each.lag_variance for each in responses], axis=0),
-        np.sum([each.dof for each in responses], axis=0),
+        np.sum(squared * [response.log_gain_variance for response in responses], axis=0),
+        np.sum(squared * [response.lag_variance for response in responses], axis=0),
+        np.sum([response.dof for response in responses], axis=0),
     )
     return replace(some[0], names=names, response=response, scatter=(gain, lag))
 

@@ -172,12 +172,17 @@ def _normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> Iterator[_Norma
 
 @lru_cache(maxsize=1)  # one session after the other has the same joints
 def _kept_normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> tuple[_Normals, ...]:
-    return tuple(_Normals(*(tuple(blocks) for blocks in one)) for one in _normals(draws, shapes))
+    return tuple(
+        _Normals(*(tuple(blocks) for blocks in normal)) for normal in _normals(draws, shapes)
+    )
 
 
 def _product(weights: FloatArray, normals: Iterable[FloatArray]) -> FloatArray:
     """Return weighted sums over the first axis of all draws, shape (c, draws, ...)."""
-    parts = [(weights @ one.reshape(len(one), -1)).reshape(-1, *one.shape[1:]) for one in normals]
+    parts = [
+        (weights @ normal.reshape(len(normal), -1)).reshape(-1, *normal.shape[1:])
+        for normal in normals
+    ]
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 

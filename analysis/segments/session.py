@@ -95,14 +95,16 @@ def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefa
     decided = bool(judgement.judged or judgement.unexposed or follows.in_frames)
     faults = {fault.joint: fault.spans_s for fault in judgement.faults}
     left: list[Artefact] = []
-    for one in artefacts:
-        if (one.quantity, one.flag) not in standing:
-            left.append(one)
-        elif one.joint in faults:
-            spans = [span for span in one.spans_s if overlapping(faults[one.joint], *span)]
-            left += [replace(one, spans_s=tuple(spans))] if spans else []
-        elif not (decided and one.joint in follows.commanded):
-            left.append(one)
+    for artefact in artefacts:
+        if (artefact.quantity, artefact.flag) not in standing:
+            left.append(artefact)
+        elif artefact.joint in faults:
+            spans = [
+                span for span in artefact.spans_s if overlapping(faults[artefact.joint], *span)
+            ]
+            left += [replace(artefact, spans_s=tuple(spans))] if spans else []
+        elif not (decided and artefact.joint in follows.commanded):
+            left.append(artefact)
     return tuple(left)
 
 

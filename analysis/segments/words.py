@@ -77,25 +77,25 @@ def rests_in_words(rests: Sequence[RestsOff]) -> str:
     """
     if len(rests) == 1:
         return clause_of(rests[0], plain(rests[0].joint))
-    sizes = [f"{abs(math.degrees(each.offset_rad)):.2g}" for each in rests]
+    sizes = [f"{abs(math.degrees(rest.offset_rad)):.2g}" for rest in rests]
     if len(rests) > NAMED:
         most = max(sizes, key=float)
         return f"{len(rests)} joints rest off their commands, up to {most} degrees"
-    names = ", ".join(plain(each.joint) for each in rests)
-    verb = "rest" if any(each.rests for each in rests) else "are"
+    names = ", ".join(plain(rest.joint) for rest in rests)
+    verb = "rest" if any(rest.rests for rest in rests) else "are"
     return f"{names} {verb} {', '.join(sizes[:-1])} and {sizes[-1]} degrees off their commands"
 
 
-def deviation_in_words(each: StandOut) -> str:
+def deviation_in_words(out: StandOut) -> str:
     """One deviation with its interval; the word carries the sign.
 
     Returns:
         For example ``gain 20.1 % [18.9, 21.2] less``.
     """
-    negative, text = each.deviation < 0, size_in_words(each.quantity, each.deviation, each.ci95)
-    if each.quantity == "offset":
+    negative, text = out.deviation < 0, size_in_words(out.quantity, out.deviation, out.ci95)
+    if out.quantity == "offset":
         return f"its mean {text} {'below' if negative else 'above'} its command's"
-    word = "lag" if each.quantity == "delay" else each.quantity
+    word = "lag" if out.quantity == "delay" else out.quantity
     return f"{word} {text} {'less' if negative else 'more'}"
 
 

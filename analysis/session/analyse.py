@@ -76,8 +76,8 @@ def _warn_flags(
 ) -> None:
     """Warn of each kind of artefact with its joints, and of responses lost in noise."""
     joined: dict[tuple[str, str, str], list[Artefact]] = {}
-    for one in artefacts:
-        joined.setdefault((one.flag, one.quantity, one.topic), []).append(one)
+    for artefact in artefacts:
+        joined.setdefault((artefact.flag, artefact.quantity, artefact.topic), []).append(artefact)
     for (flag, quantity, topic), same in joined.items():
         if flag == "gaps":  # of the whole session; those that matter are in the joints' flags
             continue
@@ -158,10 +158,10 @@ def measure_session(
     session.forget()
     follows = following(session, columns, whole)
     artefacts = unrefuted(find_artefacts(session, columns), follows)
-    held = tuple(one for one in artefacts if one.within(*stretch.since(start_ns)))
+    held = tuple(artefact for artefact in artefacts if artefact.within(*stretch.since(start_ns)))
     session.forget()
     false = [one.joint for one in held if one.falsifies("position")]
-    sound = {name: one for name, one in responses.items() if name not in false}
+    sound = {name: response for name, response in responses.items() if name not in false}
     gait = _gait(commands, sound, stretch.duration_s, options.period_s, warn)
     span = _span(stretch, origin_ns, gait)
     faulty = not_following(follows)
@@ -211,7 +211,7 @@ def measure_session(
         if gait is None
         else compare_joints(
             session.robot,
-            [each.fit for each in gaits] or [gait],
+            [gait.fit for gait in gaits] or [gait],
             joints,
             faulty=faulty,
             commanded=commanded,
@@ -369,7 +369,7 @@ def _tracked(
     planes = by_plane(robot, () if alone else others).values()
     judged = follows.judgement
     statements = (*judged.faults, *judged.changes, *judged.extra, *judged.apart)
-    tracked = track_joints(others, sound, planes, {each.joint for each in statements})
+    tracked = track_joints(others, sound, planes, {statement.joint for statement in statements})
     offsets = {} if gait is None else gait_offsets(gait, sound)
     return dataclasses.replace(tracked, offsets=offsets)
 
@@ -378,7 +378,9 @@ def _warn_dropped(
     commands: Mapping[str, Series], responses: Mapping[str, Series], warn: Warn
 ) -> None:
     for kind, series in (("command", commands), ("response", responses)):
-        lost = [one for one in series.values() if one.dropped_nan or one.dropped_duplicates]
+        lost = [
+            series for series in series.values() if series.dropped_nan or series.dropped_duplicates
+        ]
         if lost:
             nan = sum(one.dropped_nan for one in lost)
             double = sum(one.dropped_duplicates for one in lost)
@@ -386,7 +388,7 @@ def _warn_dropped(
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
-            few = nan + double <= _FEW * sum(one.count for one in series.values())
+            few = nan + double <= _FEW * sum(series.count for series in series.values())
             warn(Note(text) if few else text)
 
 

@@ -130,9 +130,9 @@ def response_over_time(
     if logged is None:
         return None
     false: dict[str, list[Span]] = {}
-    for one in artefacts:
-        if one.falsifies("position"):
-            false.setdefault(one.joint, []).extend(one.spans_s)
+    for artefact in artefacts:
+        if artefact.falsifies("position"):
+            false.setdefault(artefact.joint, []).extend(artefact.spans_s)
     planes = planes_of(session.robot)
     runs = logged.runs()
     paces = {name: logged.paces(name, runs) for name in logged.phases}
@@ -157,7 +157,7 @@ def response_over_time(
     samples = sum(one.t_ns.size for one in (*columns.command.values(), *columns.position.values()))
     found = in_threads(of_joint, columns.names, samples, session.forget)
     joints = [one for one in found if one is not None]
-    if not any(any(g is not None for g in one.gain) for one in joints):
+    if not any(any(g is not None for g in joint.gain) for joint in joints):
         why = "no whole cycle of the logged phase drives a joint"
         warn(Note(f"gain and lag over time are null: {why}"))
         return None
@@ -227,12 +227,12 @@ def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
     return Phase(t_s, whole) if np.all(np.diff(whole) > 0) else None
 
 
-def _estimates(found: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
+def _estimates(cycles: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
     """Gain and lag with their intervals, as :mod:`.analysis.response.response` has them."""
-    factor = t_factor(found.dof) if found.dof > 0 else float("nan")
-    gain, lag = np.abs(found.ratio), -np.angle(found.ratio)
-    half = factor * np.sqrt(found.variance)
-    known = np.isfinite(found.ratio) & (gain > 0)
+    factor = t_factor(cycles.dof) if cycles.dof > 0 else float("nan")
+    gain, lag = np.abs(cycles.ratio), -np.angle(cycles.ratio)
+    half = factor * np.sqrt(cycles.variance)
+    known = np.isfinite(cycles.ratio) & (gain > 0)
     sure = known & (half < 1)
     half = np.where(sure, half, 0.0)
     low, high = gain * np.exp(-half), gain * np.exp(half)
@@ -293,8 +293,8 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
     }
     whole: dict[str, BoolArray] = {}
     starts: dict[str, IntArray] = {}
-    for name, one in parts.items():
-        weighed = weigh(one.t_s, span.start_s, span.stop_s, span.cycles)
+    for name, part in parts.items():
+        weighed = weigh(part.t_s, span.start_s, span.stop_s, span.cycles)
         whole[name], starts[name] = weighed.covered >= LEAST_COVERED, weighed.starts
     nothing = np.full(span.cycles, np.nan, dtype=np.complex128)
     ratio: list[ComplexArray] = []
@@ -308,9 +308,9 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
         else:
             ratio.append(nothing)
     power = {
-        name: np.where(whole[name], one.mechanical.net_j, np.nan)
-        for name, one in measured.energies.items()
-        if one.mechanical is not None and name in whole
+        name: np.where(whole[name], energy.mechanical.net_j, np.nan)
+        for name, energy in measured.energies.items()
+        if energy.mechanical is not None and name in whole
     }
     period = (span.stop_s - span.start_s) / span.cycles
     edges = np.linspace(span.start_s, span.stop_s, span.cycles + 1)

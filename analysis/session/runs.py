@@ -214,7 +214,7 @@ def gait_run(
     if gait is None or not gait.driven:
         nothing = np.zeros(0, dtype=np.complex128)
         return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, _unknown(0), posture)
-    group_of = {joint: k for k, one in enumerate(gait.groups) for joint in one.driven}
+    group_of = {joint: k for k, group in enumerate(gait.groups) for joint in group.driven}
     chain = [joint.name for joint in analysis.joints if joint.name in group_of]
     names = tuple(chain) if gait.others else gait.driven
     command = np.zeros(len(names), dtype=np.complex128)
@@ -247,7 +247,7 @@ def gait_run(
         response=response,
         posture=posture,
         group=tuple(group_of[joint] for joint in names),
-        frequencies_hz=tuple(one.fit.frequency_hz for one in gait.groups),
+        frequencies_hz=tuple(group.fit.frequency_hz for group in gait.groups),
         waves=tuple(waves),
     )
 
@@ -412,7 +412,7 @@ def _difference(run: GaitRun, model: GaitRun) -> str | None:
     """What makes a run another gait than the model's or its reverse; None if nothing does."""
     if (drive := _other_drive(run, model)) is not None:
         return drive
-    same = [own == way for own, way in zip(run.waves, model.waves, strict=True)]
+    same = [wave == way for wave, way in zip(run.waves, model.waves, strict=True)]
     if any(same) != all(same):
         return f"has another direction of the wave than {model.label} in some groups only"
     if not all(same) and run.group != run.group[::-1]:

@@ -201,15 +201,15 @@ def limits_of(session: SessionView) -> dict[str, Limits]:
         return {}
     # A twin's servos are as they are stated, whatever the robot's may be.
     known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
-    found: dict[str, Limits] = {}
+    limits: dict[str, Limits] = {}
     for joint in robot.joints:
         servo = joint.servo
         sizes = (servo.stall_torque, servo.supply_v / servo.resistance_ohm, servo.supply_v)
-        found[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, known)
-    return found
+        limits[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, known)
+    return limits
 
 
-def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:
+def saturated(series: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:
     """Return the stretches in which a channel is at a limit.
 
     Args:
@@ -218,10 +218,10 @@ def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Sp
     Returns:
         The stretches; none if they are less than ``AT_LIMIT_SHARE`` of the samples.
     """
-    at = (one.values <= lower + slack) | (one.values >= upper - slack)
-    if np.count_nonzero(at) <= AT_LIMIT_SHARE * one.count:
+    at = (series.values <= lower + slack) | (series.values >= upper - slack)
+    if np.count_nonzero(at) <= AT_LIMIT_SHARE * series.count:
         return ()
-    return spans_of(one.t_s, at, join=2)
+    return spans_of(series.t_s, at, join=2)
 
 
 def stalled(
@@ -319,7 +319,7 @@ def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
     yield from found
     # What a sensor falsifies says nothing about a limit.
     false = {quantity for quantity, flag, _, _ in found if flag in FALSIFYING}
-    yield from (one for one in _at_limits(joint) if one[0] not in false)
+    yield from (at_limit for at_limit in _at_limits(joint) if at_limit[0] not in false)
     for quantity in ("command", "position"):
         if quantity in joint.series:
             yield from _of_record(quantity, joint, origin_ns)
@@ -328,7 +328,7 @@ def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
 def _of_sensors(joint: _Joint) -> _Found:
     levels = () if joint.limits is None else joint.limits.values
     command = joint.series.get("command") if joint.driven else None
-    sensed = {key: one for key, one in joint.series.items() if key != "command"}
+    sensed = {key: series for key, series in joint.series.items() if key != "command"}
     against = {"position": command}
     tops = {key: clipped(one, levels, against.get(key)) for key, one in sensed.items()}
     if "position" not in joint.series:

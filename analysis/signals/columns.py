@@ -287,23 +287,23 @@ def _check_robots(session: SessionView, topics: JointTopics) -> None:
         )
 
 
-def _check_nodes(session: SessionView, found: Mapping[str, JointSignals]) -> None:
+def _check_nodes(session: SessionView, signals: Mapping[str, JointSignals]) -> None:
     """Raise DataError if commands or positions come from two nodes."""
     for key in ("command", "position"):
-        if key in found and are_of_two_nodes(found[key].values):
-            why = f"{in_turn(found[key].topic)}; record one of them alone"
+        if key in signals and are_of_two_nodes(signals[key].values):
+            why = f"{in_turn(signals[key].topic)}; record one of them alone"
             raise DataError(f"{session.path.name}: {why}")
 
 
-def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: Warn) -> None:
+def _check_voltage(session: SessionView, signals: dict[str, JointSignals], warn: Warn) -> None:
     """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
     both = {"current": CURRENT_TOPIC, "voltage": VOLTAGE_TOPIC}
-    lacking = [topic for key, topic in both.items() if key not in found]
-    accumulated = PowerTopic.ELECTRICAL in found and PowerTopic.ELECTRICAL_PLUS in found
+    lacking = [topic for key, topic in both.items() if key not in signals]
+    accumulated = PowerTopic.ELECTRICAL in signals and PowerTopic.ELECTRICAL_PLUS in signals
     if lacking:
         if not accumulated:
             warn(Note(f"no {' and no '.join(lacking)}: electrical energies are null"))
-        found.pop("current", None)
+        signals.pop("current", None)
         return
     if not accumulated and "scenario" not in session.metadata.get("undulog", {}):
         taken = f"{VOLTAGE_TOPIC} is taken as the voltage at the motor"

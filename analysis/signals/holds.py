@@ -185,7 +185,7 @@ def clipped(
     span = top - bottom
     if span == 0:
         return ()
-    found: list[Span] = []
+    spans: list[Span] = []
     for level, sign in ((top, 1.0), (bottom, -1.0)):
         if any(abs(level - limit) <= 0.01 * max(abs(limit), span) for limit in limits):
             continue
@@ -201,8 +201,8 @@ def clipped(
         if command is not None and np.any(lost):
             lost &= _centred(series, command, i, j, sign)
         if np.count_nonzero(lost) >= _TOPS:
-            found += _span_each(t_s, i[lost], j[lost])
-    return tuple(sorted(found))
+            spans += _span_each(t_s, i[lost], j[lost])
+    return tuple(sorted(spans))
 
 
 def _centred(

@@ -139,29 +139,29 @@ class Compared:
         Args:
             marked: Shape (c,).
         """
-        found: list[Span] = []
+        spans: list[Span] = []
         starts, stops = self.start_s[marked].tolist(), self.stop_s[marked].tolist()
         for start, stop in zip(starts, stops, strict=True):
-            if found and found[-1][1] == start:
-                found[-1] = (found[-1][0], stop)
+            if spans and spans[-1][1] == start:
+                spans[-1] = (spans[-1][0], stop)
             else:
-                found.append((start, stop))
-        return tuple(found)
+                spans.append((start, stop))
+        return tuple(spans)
 
 
-def turns(one: Series) -> FloatArray:
+def turns(series: Series) -> FloatArray:
     """Return the times at which a signal swings up through its middle.
 
     Returns:
         Between them lies a cycle each [s]; with hysteresis, so that noise makes none.
     """
-    middle, spread = float(np.median(one.values)), float(np.std(one.values))
-    far = np.abs(one.values - middle) > 0.25 * spread
+    middle, spread = float(np.median(series.values)), float(np.std(series.values))
+    far = np.abs(series.values - middle) > 0.25 * spread
     if spread == 0 or not np.any(far):
         return np.zeros(0)
     at = np.flatnonzero(far)
-    high = one.values[at] > middle
-    return one.t_s[at[1:][high[1:] & ~high[:-1]]]
+    high = series.values[at] > middle
+    return series.t_s[at[1:][high[1:] & ~high[:-1]]]
 
 
 def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool = False) -> Compared:
@@ -237,9 +237,9 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     return _found(one, signs | {"scale_mismatch": clear & off & ~unit})
 
 
-def rate_of(one: Series) -> Series:
+def rate_of(series: Series) -> Series:
     """Return the time derivative of a signal with two samples or more, by central differences."""
-    return Series(one.name, one.t_s, np.gradient(one.values, one.t_s))
+    return Series(series.name, series.t_s, np.gradient(series.values, series.t_s))
 
 
 def integral(velocity: Series) -> Series:
@@ -255,14 +255,14 @@ def integral(velocity: Series) -> Series:
     return Series(velocity.name, velocity.t_s, np.concatenate(([0.0], np.cumsum(part))))
 
 
-def _hole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
+def _hole(series: Series, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
     """Return the time in each cycle that lies in a channel's gaps [s]."""
-    if not one.gaps.size:
+    if not series.gaps.size:
         return np.zeros(start_s.size)
-    step = np.zeros(one.count)
-    step[one.gaps + 1] = one.t_s[one.gaps + 1] - one.t_s[one.gaps]
+    step = np.zeros(series.count)
+    step[series.gaps + 1] = series.t_s[series.gaps + 1] - series.t_s[series.gaps]
     lost = np.cumsum(step)
-    return np.interp(stop_s, one.t_s, lost) - np.interp(start_s, one.t_s, lost)
+    return np.interp(stop_s, series.t_s, lost) - np.interp(start_s, series.t_s, lost)
 
 
 def _correlated(residual: FloatArray) -> float:

@@ -65,18 +65,18 @@ class Options:
 SharedTimes = dict[int, tuple[slice, IntArray]]
 
 
-def part_of(one: Signal, start_ns: int, stop_ns: int, times: SharedTimes) -> Signal:
+def part_of(signal: Signal, start_ns: int, stop_ns: int, times: SharedTimes) -> Signal:
     """Return the samples of a signal within a half-open window.
 
     Args:
         times: Filled with the times of the parts, so that signals which share their times before
             share them afterwards.
     """
-    if id(one.t_ns) not in times:
-        inside = slice(*np.searchsorted(one.t_ns, (start_ns, stop_ns)).tolist())
-        times[id(one.t_ns)] = inside, one.t_ns[inside]
-    inside, t_ns = times[id(one.t_ns)]
-    return Signal(one.name, one.unit, t_ns, one.values[inside])
+    if id(signal.t_ns) not in times:
+        inside = slice(*np.searchsorted(signal.t_ns, (start_ns, stop_ns)).tolist())
+        times[id(signal.t_ns)] = inside, signal.t_ns[inside]
+    inside, t_ns = times[id(signal.t_ns)]
+    return Signal(signal.name, signal.unit, t_ns, signal.values[inside])
 
 
 def series_in(
@@ -122,7 +122,7 @@ def without_breaks(
 
     def parts_of(signals: Mapping[str, Signal]) -> dict[str, Signal]:
         limits = found.start_ns, found.last_ns + 1
-        return {name: part_of(one, *limits, shared) for name, one in signals.items()}
+        return {name: part_of(signal, *limits, shared) for name, signal in signals.items()}
 
     kept = replace(
         columns,
@@ -220,8 +220,8 @@ def _too_short(columns: Columns, chosen: Stretch, later: Stretch) -> bool:
 
 
 def _has_gait(columns: Columns, stretch: Stretch) -> bool:
-    found = find_groups(_swinging(columns, stretch), stretch.duration_s)
-    return found is not None and found.explained >= MIN_EXPLAINED
+    groups = find_groups(_swinging(columns, stretch), stretch.duration_s)
+    return groups is not None and groups.explained >= MIN_EXPLAINED
 
 
 def _swinging(columns: Columns, stretch: Stretch) -> list[Series]:
@@ -307,7 +307,7 @@ def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: War
     if fastest <= 0:
         return []
     for ignore in ((), ("offset",)):
-        found: list[Stretch] = []
+        stretches: list[Stretch] = []
         least_s = (MIN_CYCLES - 1) / fastest  # each run's own frequency decides below
         for run in steady_runs(t_ns, logged.names, values, ignore, least_s=least_s):
             part = settled(run, start_ns, settle_s)
@@ -315,11 +315,11 @@ def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: War
             row = int(np.searchsorted(t_ns, run.start_ns))
             frequency = max(abs(float(values[row, k])) for k in omegas) / (2 * math.pi)
             if long_enough(part.duration_s, frequency):
-                found.append(part)
-        if found:
+                stretches.append(part)
+        if stretches:
             if ignore:
                 warn("the gait's offset changes within the analysed stretch: the robot steers")
-            return found
+            return stretches
     return []
 
 
@@ -336,12 +336,12 @@ def _in_motion(
     origin = stretch.start_ns
     if not stated:
         soft = span
-        span = steady_part([one.between(span[0], span[1]) for one in series], *span)
+        span = steady_part([series.between(span[0], span[1]) for series in series], *span)
         start_s = span[0] if options.start_s is None else soft[0]
         span = start_s, span[1] if options.stop_s is None else soft[1]
         _warn_soft(soft, span, warn)
     start, stop = (origin + round(time_s * NS) for time_s in span)
-    period = max((one.period_s for one in series if one.count > 1), default=0.0)
+    period = max((series.period_s for series in series if series.count > 1), default=0.0)
     # Moving to the last sample: that sample's own interval belongs to it.
     ends = stretch.stop_ns - stop <= 2 * round(period * NS)
     return stretch.intersect(start, None if ends else stop)

@@ -76,17 +76,17 @@ def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tu
         Start and end of the steady part [s]; those of the motion where it has no soft start or no
         soft stop, or where less than ``MIN_CYCLES`` steady cycles would be left.
     """
-    found = find_groups(commands, stop_s - start_s)
-    if found is None:
+    groups = find_groups(commands, stop_s - start_s)
+    if groups is None:
         return start_s, stop_s
     first_s, last_s = start_s, stop_s
     slowest_s = 0.0
-    for rhythm in found.rhythms:
-        members = [one for one in commands if one.name in rhythm.names]
+    for rhythm in groups.rhythms:
+        members = [command for command in commands if command.name in rhythm.names]
         omega = rhythm.omega * _strongest(rhythm)
         period_s = 2 * np.pi / omega
         slowest_s = max(slowest_s, period_s)
-        if (stop_s - start_s) / period_s > sum(one.t_s.size for one in members):
+        if (stop_s - start_s) / period_s > sum(member.t_s.size for member in members):
             continue  # most of these cycles have no sample: there is no soft start to be seen
         edges_s = np.arange(start_s, stop_s + 1e-6 * period_s, period_s / _PARTS)
         lead, tail = soft_ends(amplitude_by_cycle(members, omega, edges_s))
@@ -119,12 +119,12 @@ def amplitude_by_cycle(commands: Sequence[Series], omega: float, edges_s: FloatA
     """
     count = max(edges_s.size - _PARTS, 0)
     power, motion = np.zeros((2, count))
-    for one in commands:
-        starts = starts_of(one.t_s, edges_s)
+    for command in commands:
+        starts = starts_of(command.t_s, edges_s)
         begin, end = starts[:count], starts[_PARTS : _PARTS + count]
-        cosine, sine = cos_sin(omega * one.t_s)
-        rows = np.stack([np.ones(one.count), cosine, -sine])
-        values = one.values - one.values.mean()
+        cosine, sine = cos_sin(omega * command.t_s)
+        rows = np.stack([np.ones(command.count), cosine, -sine])
+        values = command.values - command.values.mean()
         usable: BoolArray = end - begin >= _LEAST_SAMPLES
         gram = np.stack([_sums(rows * row, begin, end) for row in rows], axis=1)[usable]
         solved = np.linalg.solve(gram, _sums(rows * values, begin, end)[usable][..., None])[..., 0]
@@ -333,7 +333,7 @@ def moving(commands: Sequence[Series]) -> tuple[float, float] | None:
     Returns:
         Times [s], or None where no command ever moves.
     """
-    each = [(one.t_s, np.flatnonzero(np.diff(one.values) != 0)) for one in commands]
+    each = [(command.t_s, np.flatnonzero(np.diff(command.values) != 0)) for command in commands]
     known = [(float(t_s[k[0]]), float(t_s[k[-1] + 1])) for t_s, k in each if k.size]
     return (min(known)[0], max(stop for _, stop in known)) if known else None
 

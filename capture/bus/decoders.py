@@ -181,7 +181,7 @@ class RegisterDecoder:
         signals: dict[Quantity, list[BusSignal]] = {}
         for signal in bus.signals:
             signals.setdefault(signal.quantity, []).append(signal)
-        self._signals = {quantity: tuple(own) for quantity, own in signals.items()}
+        self._signals = {quantity: tuple(signal) for quantity, signal in signals.items()}
         self._member: dict[Quantity, IntArray] = {}
         self._scales: dict[Quantity, FloatArray] = {}
         for quantity, own in self._signals.items():
@@ -281,8 +281,8 @@ class RegisterDecoder:
         return found
 
     def _decoded(self, layout: _Layout, t_ns: IntArray) -> Iterator[DecodedSignals]:
-        row, motor = np.array([one[:2] for one in layout.samples], dtype=np.int64).T
-        data = np.frombuffer(b"".join(one[2] for one in layout.samples), np.uint8)
+        row, motor = np.array([sample[:2] for sample in layout.samples], dtype=np.int64).T
+        data = np.frombuffer(b"".join(sample[2] for sample in layout.samples), np.uint8)
         data = data.reshape(len(row), -1)
         layout.samples = []
         times = t_ns[row]

@@ -49,7 +49,7 @@ def poll_frames(robot: Robot) -> FrameArray:
     frames["dir"] = DIR_TX
     for frame, poll in zip(frames, bus.polls, strict=True):
         message = _classic(messages, poll.message, robot)
-        fields = {each.name: BitField.of(each) for each in message.signals}
+        fields = {signal.name: BitField.of(signal) for signal in message.signals}
         word = 0
         for name, number in poll.signals:
             word |= fields[name].placed(number, message.length)
@@ -186,7 +186,7 @@ def _classic(messages: Mapping[str, Message], name: str, robot: Robot) -> Messag
 
 def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
     """Return one frame for each combination of multiplexer values that the entries need."""
-    dbc = {each.name: each for each in message.signals}
+    dbc = {signal.name: signal for signal in message.signals}
     entries = {signal: compile_entry(message, signal) for signal in signals}
     # The multiplexers above each entry, with the least values that select it.
     selections = dict.fromkeys(

@@ -255,7 +255,7 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
         )
     check_bus(robot)
     messages = database_messages(dict(robot.databases), Faults()) or {}
-    named = {each.message for each in (*robot.bus.signals, *robot.bus.polls)}
+    named = {signal.message for signal in (*robot.bus.signals, *robot.bus.polls)}
     if missing := named - set(messages):
         raise DataError(f"no database of {robot.name} has {', '.join(sorted(missing))}")
     return robot.bus, messages
@@ -278,7 +278,7 @@ def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
 
 def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
     """Compile one entry."""
-    by_name = {each.name: each for each in message.signals}
+    by_name = {signal.name: signal for signal in message.signals}
     wanted = by_name[signal.signal]
     bits = BitField.of(wanted)
     conditions = conditions_of(wanted, by_name)

@@ -140,8 +140,8 @@ class MoteusDecoder:
         t_ns = frames["t_host_ns"].astype(np.int64)
         decoded: list[DecodedSignals] = []
         for quantity, rows in samples.items():
-            row, motor = np.array([each[:2] for each in rows], dtype=np.int64).T
-            values = np.array([each[2] for each in rows])
+            row, motor = np.array([row[:2] for row in rows], dtype=np.int64).T
+            values = np.array([row[2] for row in rows])
             signals, unit = self._signals[quantity], SESSION_UNIT[quantity]
             decoded.append(DecodedSignals(signals, unit, row, motor, t_ns[row], values))
         return tuple(decoded), tally

@@ -95,7 +95,10 @@ def log_export(
     source: Any = [str(path) for path in read] if target.several else str(read)
     facts = {"source": source, "output": str(output), **written.facts}
     facts["warnings"] = written.warnings
-    lines = [f"{output}: {written.what}", *(f"  warning: {each}" for each in written.warnings)]
+    lines = [
+        f"{output}: {written.what}",
+        *(f"  warning: {warning}" for warning in written.warnings),
+    ]
     emit(facts, lines, as_json=json)
 
 

@@ -239,29 +239,29 @@ def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
     if len(paths) > 1:
         return show(each(paths, "log check", _contract_line), as_json=as_json)
     (path,) = paths
-    found = check_contract(path)
-    facts = _contract_facts(path, found)
-    verdict = f"{_count(found)} of" if found else f"follows all {len(RULES)} rules of"
+    contract = check_contract(path)
+    facts = _contract_facts(path, contract)
+    verdict = f"{_count(contract)} of" if contract else f"follows all {len(RULES)} rules of"
     head = f"{path.name}: {verdict} the log contract, version {facts['contract']}"
-    emit(facts, [head, *(f"  {one}" for one in found)], as_json=as_json)
-    return int(bool(found))
+    emit(facts, [head, *(f"  {one}" for one in contract)], as_json=as_json)
+    return int(bool(contract))
 
 
 def _contract_line(path: Path) -> Line:
     from ..log.health.contract import check_contract
     from ..log.read.session import Session
 
-    found = check_contract(path)
+    contract = check_contract(path)
     with Session.open(path) as session:
         robot = session.robot.name if session.robot is not None else ""
         gait = stated_gait(session.metadata)
-    first = str(found[0]) if found else "follows the log contract"
-    verdict = _count(found) if found else "follows"
-    return Line(robot, gait, verdict, first, _contract_facts(path, found), not found)
+    first = str(contract[0]) if contract else "follows the log contract"
+    verdict = _count(contract) if contract else "follows"
+    return Line(robot, gait, verdict, first, _contract_facts(path, contract), not contract)
 
 
-def _count(found: Sequence[Violation]) -> str:
-    return f"{len(found)} violation{'s' if len(found) != 1 else ''}"
+def _count(violations: Sequence[Violation]) -> str:
+    return f"{len(violations)} violation{'s' if len(violations) != 1 else ''}"
 
 
 def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
@@ -294,8 +294,8 @@ def as_json(health: SessionHealth) -> dict[str, Any]:
         ``series``, ``joints``, ``buses``, ``sources``; what can't be computed is null.
     """
     series = [
-        asdict(each) | {"timing": asdict(each.timing) | {"rate_hz": each.timing.rate_hz}}
-        for each in health.series
+        asdict(series) | {"timing": asdict(series.timing) | {"rate_hz": series.timing.rate_hz}}
+        for series in health.series
     ]
     return {
         "verdict": health.verdict,
@@ -354,26 +354,26 @@ def _stored_line(health: SessionHealth) -> str:
 
 
 def _series_lines(health: SessionHealth) -> Iterator[str]:
-    width = max([len(each.label) for each in health.series] + [6])
+    width = max([len(series.label) for series in health.series] + [6])
     yield ""
     yield (
         f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
         f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}"
     )
-    yield from (_series_line(each, width) for each in health.series)
+    yield from (_series_line(series, width) for series in health.series)
 
 
-def _series_line(each: SeriesHealth, width: int) -> str:
-    timing = each.timing
+def _series_line(health: SeriesHealth, width: int) -> str:
+    timing = health.timing
     rhythm = timing.regular and timing.median_s
     jitter = f"{(timing.std_s or 0) / timing.median_s:.1%}" if rhythm and timing.median_s else "-"
     p99 = f"{(timing.p99_s or 0) / timing.median_s:.2f}" if rhythm and timing.median_s else "-"
     gaps, missing = (timing.gaps, timing.missing) if rhythm else ("-", "-")
     rate = f"{timing.rate_hz:.1f}" if timing.rate_hz is not None else "-"
     return (
-        f"{each.label:<{width}}  {timing.count:>8}  {rate:>8}  {gaps:>5}  {missing:>7}  "
+        f"{health.label:<{width}}  {timing.count:>8}  {rate:>8}  {gaps:>5}  {missing:>7}  "
         f"{timing.longest_s:>9.3g}  {jitter:>6}  {p99:>5}  {timing.duplicates:>5}  "
-        f"{timing.backward:>4}  {each.nan:>6}"
+        f"{timing.backward:>4}  {health.nan:>6}"
     )
 
 
@@ -381,7 +381,7 @@ def _sequence_lines(health: SessionHealth) -> Iterator[str]:
     kinds: dict[str, list[str]] = {}
     for channel in health.channels:
         kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
-    counted = [each for each in health.channels if each.sequence.kind == "counted"]
+    counted = [channel for channel in health.channels if channel.sequence.kind == "counted"]
     dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
     yield ""
     if counted:

@@ -305,7 +305,7 @@ def seen_joints(session: SessionView) -> list[SeenJoint]:
     commands: JointSignals | None = None
     if COMMAND_TOPIC in session.channels:
         commands = session.joints(COMMAND_TOPIC)
-    found: list[SeenJoint] = []
+    joints: list[SeenJoint] = []
     for name in measured.names:
         angle = measured.signal(name)
         values = [angle.values * scale]
@@ -319,10 +319,10 @@ def seen_joints(session: SessionView) -> list[SeenJoint]:
         known, rate = known[np.isfinite(known)], rate[np.isfinite(rate)]
         if len(known):
             fastest = float(rate.max(initial=0.0))
-            found.append(SeenJoint(name, float(known.min()), float(known.max()), fastest))
-    if not found:
+            joints.append(SeenJoint(name, float(known.min()), float(known.max()), fastest))
+    if not joints:
         raise DataError(f"{session.path}: {measured.topic} has no angle of any joint")
-    return found
+    return joints
 
 
 def _scale(session: SessionView, signals: JointSignals) -> float:
@@ -357,7 +357,7 @@ def draft(name: str, joints: Sequence[SeenJoint] | None = None, log: str = "") -
 
     if joints is None:
         names = numbered("joint", 2)
-        lines = [_line(one, -0.52, 0.52, 10.0, "assumed") for one in names]
+        lines = [_line(name, -0.52, 0.52, 10.0, "assumed") for name in names]
     else:
         names = [joint.name for joint in joints]
         lines = [_seen(joint) for joint in joints]

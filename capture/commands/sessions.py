@@ -54,11 +54,11 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
     """
     from ..common.remote import as_path
 
-    found: list[Path] = []
+    paths: list[Path] = []
     for path in map(as_path, given):
         own = _named(path)
-        found += [one for one in own if one == path or one not in found]
-    return found
+        paths += [one for one in own if one == path or one not in paths]
+    return paths
 
 
 def are_as_given(paths: Sequence[Path], given: Iterable[Path]) -> bool:
@@ -82,7 +82,7 @@ def _named(path: Path) -> list[Path]:
         return [path] if plain or not found else found
     if has_magic(str(path)) and not path.exists():
         matches = sorted(map(Path, glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
-        return list(dict.fromkeys(one for each in matches for one in _matched(each))) or [path]
+        return list(dict.fromkeys(one for match in matches for one in _matched(match))) or [path]
     return [path]
 
 

@@ -55,10 +55,10 @@ def parse_size(value: object) -> int:
         DataError: If it is no size; the message describes a valid one.
     """
     wanted = "a size such as 500MB or 1GiB"
-    found = _AMOUNT.fullmatch(_text(value, wanted))
-    if found is None:
+    match = _AMOUNT.fullmatch(_text(value, wanted))
+    if match is None:
         raise DataError(wanted)
-    return _whole(Fraction(found[1]) * _factor(found[2] or "B", SIZE_UNITS, "size"), "bytes")
+    return _whole(Fraction(match[1]) * _factor(match[2] or "B", SIZE_UNITS, "size"), "bytes")
 
 
 def parse_duration_ns(value: object) -> int:

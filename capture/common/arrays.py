@@ -31,10 +31,10 @@ def merged_ranges(
     ranges: Iterable[tuple[_Number, _Number]], gap: float
 ) -> list[tuple[_Number, _Number]]:
     """Join ranges, in order of their starts, that are no further apart than a gap."""
-    found: list[tuple[_Number, _Number]] = []
+    numbers: list[tuple[_Number, _Number]] = []
     for start, stop in ranges:
-        if found and start - found[-1][1] <= gap:
-            found[-1] = found[-1][0], max(found[-1][1], stop)
+        if numbers and start - numbers[-1][1] <= gap:
+            numbers[-1] = numbers[-1][0], max(numbers[-1][1], stop)
         else:
-            found.append((start, stop))
-    return found
+            numbers.append((start, stop))
+    return numbers

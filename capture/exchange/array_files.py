@@ -230,7 +230,7 @@ def _named(value: object) -> dict[str, _Tensor | None]:
     Raises:
         ValueError: If there are too many, as of dictionaries that hold each other many times.
     """
-    found: dict[str, _Tensor | None] = {}
+    tensors: dict[str, _Tensor | None] = {}
     waiting: list[tuple[str, object, int]] = [("", value, 0)]
     seen = 0
     while waiting:
@@ -239,7 +239,7 @@ def _named(value: object) -> dict[str, _Tensor | None]:
         if seen > _MOST_NAMES or depth > _DEEPEST or len(name) > _LONGEST_NAME:
             raise ValueError(f"more than {_MOST_NAMES} names, or one of {name[:40]!r} is too long")
         if isinstance(item, _Tensor):
-            found[name or "tensor"] = item if item.storage.dtype else None
+            tensors[name or "tensor"] = item if item.storage.dtype else None
         elif isinstance(item, Mapping):
             inner = list(cast("Mapping[object, object]", item).items())
             waiting += [
@@ -247,8 +247,8 @@ def _named(value: object) -> dict[str, _Tensor | None]:
                 for key, each in inner[::-1]
             ]
         else:
-            found[name] = None
-    return found
+            tensors[name] = None
+    return tensors
 
 
 class _Storages:

@@ -121,7 +121,9 @@ def import_bag(
             others = _Others(session.files[0], session, writer, joints.taken, report)
             for share in others.write(stop):
                 bar.update(begun + (1 - begun) * (1 + share) / 2, "other topics")
-        report.problems += [one for one in session.warnings if one not in report.problems]
+        report.problems += [
+            warning for warning in session.warnings if warning not in report.problems
+        ]
         writer.set_verdict(report.verdict, [*report.problems, *report.notes])
     return report
 
@@ -200,10 +202,10 @@ class _Target:
         at = {name: j for j, name in enumerate(self.joints)}
         matrices: list[NDArray[Any]] = []
         known = False
-        for one in rows:
+        for row in rows:
             matrix = np.full((len(log_ns), len(self.joints)), np.nan)
-            if one.names and one.values.shape == (len(log_ns), len(one.names)):
-                matrix[:, [at[name] for name in one.names]] = one.values
+            if row.names and row.values.shape == (len(log_ns), len(row.names)):
+                matrix[:, [at[name] for name in row.names]] = row.values
                 known = True
             matrices.append(matrix)
         return [log_ns, stamp_ns, *matrices] if known else None
@@ -217,12 +219,16 @@ class _Joints:
     """
 
     def __init__(
-        self, session: Session, writer: SessionWriter, found: JointTopics, report: ImportReport
+        self, session: Session, writer: SessionWriter, topics: JointTopics, report: ImportReport
     ) -> None:
         self._session, self._report = session, report
         self._targets: list[_Target] = []
         self.taken: set[str] = set()
-        names = {COMMAND_TOPIC: found.command, RESPONSE_TOPIC: found.response, **found.quantities}
+        names = {
+            COMMAND_TOPIC: topics.command,
+            RESPONSE_TOPIC: topics.response,
+            **topics.quantities,
+        }
         for topic, name in names.items():
             source = joint_source(name, session.channels)
             if source is None or (target := self._target(writer, topic, name)) is None:
@@ -263,11 +269,11 @@ class _Joints:
     def write(self, stop: StopRequest | None) -> Iterator[float]:
         """Write all windows; yields the share that is done."""
         first, last = self._session.start_ns, self._session.end_ns + 1
-        windowed = [one for one in self._targets if not one.is_whole]
-        self._write_window([one for one in self._targets if one.is_whole], None, None)
+        windowed = [target for target in self._targets if not target.is_whole]
+        self._write_window([target for target in self._targets if target.is_whole], None, None)
         step = max(_WINDOW_NS, (last - first) // _MOST_WINDOWS)
         spans = self._session.chunk_times_ns
-        begins, ends = (np.minimum(each, LAST_NS).astype(np.int64) for each in spans)
+        begins, ends = (np.minimum(span, LAST_NS).astype(np.int64) for span in spans)
         for start in range(first, last, step):
             if not ((begins < start + step) & (ends >= start)).any():
                 continue  # a gap
@@ -284,7 +290,7 @@ class _Joints:
         wanted = {target.name: target.fields for target in targets}
         found = self._session.joint_messages(wanted, start_ns, stop_ns) if targets else {}
         for target in targets:
-            groups = zip(*(found[target.name, one] for one in target.fields), strict=True)
+            groups = zip(*(found[target.name, field] for field in target.fields), strict=True)
             parts = [part for rows in groups if (part := target.rows(rows)) is not None]
             if not parts:
                 continue
@@ -294,7 +300,7 @@ class _Joints:
                 text = f"{target.topic}: stamps before 1970 are replaced by log times"
                 self._report.problems += [text] if text not in self._report.problems else []
             order = np.argsort(log_ns, kind="stable")
-            by_field = dict(zip(target.fields, (one[order] for one in values), strict=True))
+            by_field = dict(zip(target.fields, (value[order] for value in values), strict=True))
             none = [()] * len(order)
             columns = (by_field.get(one, none) for one in UNITS)
             write = target.channel.write

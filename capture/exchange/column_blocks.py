@@ -45,15 +45,15 @@ def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
     first, many = columns[0], len(columns)
     step, begin = first.itemsize, _address(first)
     if str(first.dtype) in {"float32", "float64"} and all(
-        each.base is first.base is not None
-        and (each.dtype, each.strides) == (first.dtype, (many * step,))
-        and _address(each) == begin + k * step
-        for k, each in enumerate(columns)
+        column.base is first.base is not None
+        and (column.dtype, column.strides) == (first.dtype, (many * step,))
+        and _address(column) == begin + k * step
+        for k, column in enumerate(columns)
     ):
         return np.lib.stride_tricks.as_strided(
             first, (len(first), many), (many * step, step), writeable=False
         )
-    single = all(each.dtype == np.float32 for each in columns)
+    single = all(column.dtype == np.float32 for column in columns)
     return np.stack(columns, axis=1, dtype=np.float32 if single else np.float64)
 
 

@@ -379,7 +379,7 @@ def _blocks(
     read = session.joint_columns({topic: list(columns)})
     sets = _aligned([read[topic, name] for name in columns])
     for number, signals in enumerate(sets):
-        for block, done in _sorted_blocks(signals, [columns[one.field] for one in signals]):
+        for block, done in _sorted_blocks(signals, [columns[signal.field] for signal in signals]):
             yield block, (number + done) / len(sets)
 
 
@@ -389,15 +389,15 @@ def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
     That is one set, but for foreign logs that leave a field empty in some messages.
     """
     sets: list[list[JointSignals]] = []
-    for one in signals:
+    for signal in signals:
         for known in sets:
-            if known[0].names == one.names and all(
-                np.array_equal(a, b) for a, b in zip(known[0].t_ns, one.t_ns, strict=True)
+            if known[0].names == signal.names and all(
+                np.array_equal(a, b) for a, b in zip(known[0].t_ns, signal.t_ns, strict=True)
             ):
-                known.append(one)
+                known.append(signal)
                 break
         else:
-            sets.append([one])
+            sets.append([signal])
     return sets
 
 
@@ -423,10 +423,10 @@ def _sorted_blocks(
             name: np.concatenate(
                 [
                     values[order[piece]]
-                    for values, order, piece in zip(one.values, orders, pieces, strict=True)
+                    for values, order, piece in zip(signal.values, orders, pieces, strict=True)
                 ]
             )[rows]
-            for name, one in zip(columns, signals, strict=True)
+            for name, signal in zip(columns, signals, strict=True)
         }
         block = RowBlock(first.topic, first.names, joint[rows], t_ns[rows], values)
         yield block, (k + 1) / (len(edges) + 1)

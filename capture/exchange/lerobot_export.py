@@ -105,11 +105,11 @@ class Episode:
 
     def names(self) -> dict[str, list[str]]:
         """Return the joints of each feature."""
-        return {name: [each.joint for each in found] for name, found in self.features.items()}
+        return {name: [each.joint for each in feature] for name, feature in self.features.items()}
 
     def _signals(self) -> Iterator[HeldSignal]:
-        for found in self.features.values():
-            yield from found
+        for feature in self.features.values():
+            yield from feature
 
 
 def export_lerobot(
@@ -377,9 +377,9 @@ class _Writer:
         kinds = {"float32": self._pa.float32(), "int64": self._pa.int64()}
         return self._pa.schema(
             [
-                (name, kinds[each["dtype"]] if each["shape"] == [1]
-                 else self._pa.list_(kinds[each["dtype"]], each["shape"][0]))
-                for name, each in self._features().items()
+                (name, kinds[feature["dtype"]] if feature["shape"] == [1]
+                 else self._pa.list_(kinds[feature["dtype"]], feature["shape"][0]))
+                for name, feature in self._features().items()
             ]
         )  # fmt: skip
 
@@ -430,7 +430,10 @@ def _stats(values: NDArray[Any]) -> dict[str, float]:
         "mean": float(wide.mean()),
         "std": float(wide.std()),
         "count": len(wide),
-        **{f"q{round(100 * q):02d}": each for q, each in zip(_QUANTILES, quantiles, strict=True)},
+        **{
+            f"q{round(100 * q):02d}": quantile
+            for q, quantile in zip(_QUANTILES, quantiles, strict=True)
+        },
     }
 
 

@@ -80,7 +80,7 @@ class LeRobotDataset:
         Raises:
             ImportFormatError: If a file is damaged, or numbers more episodes than it can hold.
         """
-        found: dict[int, list[Path]] = {}
+        paths: dict[int, list[Path]] = {}
         for path in self.files():
             numbers, most = set[int](), path.stat().st_size // _LEAST_EPISODE
             for block in self.reader.blocks(path, ["episode_index"], _ROWS):
@@ -88,10 +88,10 @@ class LeRobotDataset:
                 if len(numbers) > most:
                     refuse(path, f"numbers over {most} episodes, more than its bytes can hold")
             for episode in numbers:
-                found.setdefault(episode, []).append(path)
-        if not found:
+                paths.setdefault(episode, []).append(path)
+        if not paths:
             raise ImportFormatError(self.folder, "has no frames in data/*/*.parquet")
-        return dict(sorted(found.items()))
+        return dict(sorted(paths.items()))
 
 
 def is_lerobot(folder: Path) -> bool:

@@ -51,7 +51,7 @@ def is_frame_number(name: str) -> bool:
 def as_joints(table: TableFile) -> TableFile | None:
     """Return a table of tracks as one of joint angles; None where it holds no tracks."""
     markers = _markers(table.columns)
-    used = {name for one in markers.values() for name in (one.x, one.y, one.likelihood)}
+    used = {name for marker in markers.values() for name in (marker.x, marker.y, marker.likelihood)}
     kept = [name for name in table.columns if is_time(name) or is_frame_number(name)]
     others = [name for name in table.columns if name not in used and name not in kept]
     if len(markers) < _LEAST_MARKERS or len(others) > len(used):
@@ -62,7 +62,7 @@ def as_joints(table: TableFile) -> TableFile | None:
         wanted = [name for name in names if name in kept]
         for block in table.read([*wanted, *(name for name in used if name)], time):
             try:
-                points = [_points(block, one) for one in markers.values()]
+                points = [_points(block, marker) for marker in markers.values()]
             except (ValueError, TypeError) as error:
                 raise ImportFormatError(
                     table.path, f"has a point without numbers: {error}"

@@ -156,7 +156,7 @@ def _plots(
                 low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0, 0)
                 curve = Curve(topic, places.get(joint), color, low, high)
                 curves.setdefault(joint, []).append(curve)
-        plots = [JointPlot(name, tuple(own)) for name, own in curves.items()]
+        plots = [JointPlot(name, tuple(curve)) for name, curve in curves.items()]
         return plots, session.duration_s, session.warnings
 
 

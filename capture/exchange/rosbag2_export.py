@@ -69,7 +69,11 @@ def export_rosbag2(
     if (output / MARKER).is_file() and not is_rosbag2(output):
         raise UsageError(f"{output}: its {MARKER} is not of rosbag2: it is not replaced")
     with part_folder(output, marker=MARKER, force=force) as part, RawLog(source) as log:
-        kept = [_offered(log, each) for each in log.file.channels.values() if _is_ros(log, each)]
+        kept = [
+            _offered(log, channel)
+            for channel in log.file.channels.values()
+            if _is_ros(log, channel)
+        ]
         _check_types(log, kept)
         file = part / f"{output.name}_0.mcap"
         with file.open("wb") as stream:
@@ -81,7 +85,7 @@ def export_rosbag2(
                 copy.attach(attachment, attachment.name)
             copy.write_all(
                 f"export {output.name}",
-                ((ids[each.channel_id], each) for each in log.messages(ids)),
+                ((ids[message.channel_id], message) for message in log.messages(ids)),
                 (log.start_ns, log.end_ns),
                 stop or StopRequest(),
             )

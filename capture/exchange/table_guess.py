@@ -225,7 +225,7 @@ def _meaning(name: str, role: str, *, headerless: bool) -> _Name:
     found = words(plain)
     commanded = role == COMMANDS or bool(_COMMAND.intersection(found))
     quantities = [_QUANTITY[word] for word in found if word in _QUANTITY]
-    specific = [each for each in quantities if each is not Quantity.POSITION]
+    specific = [quantity for quantity in quantities if quantity is not Quantity.POSITION]
     measured = (specific or quantities or [None])[0]
     if commanded and measured in {None, Quantity.POSITION}:
         quantity: Quantity | None = Quantity.COMMAND

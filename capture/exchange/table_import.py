@@ -94,16 +94,16 @@ def open_tables(source: Path, commands: Path | None = None, fps: float | None = 
     if source.is_dir():
         if commands is not None:
             raise UsageError(f"{source} is a folder; --commands goes with a table of states")
-        found = _open_folder(source)
+        folder = _open_folder(source)
     else:
         tables = {STATES: open_table(source)}
         if commands is not None:
             tables[COMMANDS] = open_table(commands)
         files = [source, *([commands] if commands is not None else [])]
-        found = TableSet(source, tables, partial(digest_of, files))
-    joints = {role: as_joints(table) or table for role, table in found.tables.items()}
+        folder = TableSet(source, tables, partial(digest_of, files))
+    joints = {role: as_joints(table) or table for role, table in folder.tables.items()}
     if fps is None:
-        return replace(found, tables=joints)
+        return replace(folder, tables=joints)
     if not 0 < fps < NS:
         raise UsageError(f"--fps {fps:g}: more than 0 and less than 1e9 frames a second")
     made = {
@@ -111,7 +111,7 @@ def open_tables(source: Path, commands: Path | None = None, fps: float | None = 
         TIMES_FROM_FPS: f"{fps:g}",
     }
     tables = {role: with_fps(table, fps) for role, table in joints.items()}
-    return replace(found, tables=tables, facts={**found.facts, **made})
+    return replace(folder, tables=tables, facts={**folder.facts, **made})
 
 
 def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
@@ -332,7 +332,9 @@ class _Source:
             if not len(block[self._time]):
                 continue
             t_ns = self._checked(self._times(block[self._time]), offset)
-            values = {quantity: self._converted(own, block) for quantity, own in columns.items()}
+            values = {
+                quantity: self._converted(column, block) for quantity, column in columns.items()
+            }
             yield _Messages(
                 (int(t_ns[0]), self._order),
                 int(t_ns[-1]),

@@ -161,14 +161,14 @@ def _block(cells: Mapping[str, list[Any]], time: str) -> Block:
 def _exact(cell: str, before: Decimal | None) -> Decimal:
     """Parse a time: a double can't hold Unix times to the ns."""
     try:
-        found = Decimal(cell.strip())
+        decimal = Decimal(cell.strip())
     except InvalidOperation:
-        found = Decimal("nan")
-    if not found.is_finite():
+        decimal = Decimal("nan")
+    if not decimal.is_finite():
         raise ValueError(f"{cell!r} is not a time")
-    if before is not None and found < before:
+    if before is not None and decimal < before:
         raise ValueError(f"time goes back, from {before:g}")
-    return found
+    return decimal
 
 
 def _number(cell: str) -> float:
@@ -185,7 +185,9 @@ def _number(cell: str) -> float:
 
 def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> TableFile:
     """Take the arrays as columns whose first axis is the longest common one."""
-    plain = {name: np.squeeze(each) for name, each in arrays.items() if each.dtype.kind in "fiub"}
+    plain = {
+        name: np.squeeze(array) for name, array in arrays.items() if array.dtype.kind in "fiub"
+    }
     plain = {name: each for name, each in plain.items() if each.ndim in {1, 2} and each.size > 1}
     if not plain:
         raise ImportFormatError(path, "holds no arrays of numbers with one or two dimensions")

@@ -83,33 +83,42 @@ def export_tum(
     why = f"end the name of a trajectory in {' or '.join(SUFFIXES)}"
     check_output(output, SUFFIXES, why, force=force)
     with Session.open(source) as session:
-        found = read_trajectory(session, frame)
+        trajectory = read_trajectory(session, frame)
         warnings = session.warnings
-    norm = np.linalg.norm(found.poses[:, 3:], axis=1)
-    usable = np.isfinite(found.poses).all(axis=1) & (norm > 0.5) & (norm < 2.0)
+    norm = np.linalg.norm(trajectory.poses[:, 3:], axis=1)
+    usable = np.isfinite(trajectory.poses).all(axis=1) & (norm > 0.5) & (norm < 2.0)
     if not usable.any():
-        raise DataError(f"{source}: {found.topic} has no pose of {found.frame} with finite numbers")
+        raise DataError(
+            f"{source}: {trajectory.topic} has no pose of {trajectory.frame} with finite numbers"
+        )
     if lost := int((~usable).sum()):
         warnings.append(f"{lost} poses left out: not finite, or their quaternion is no rotation")
-    if len(found.parents) > 1:
-        warnings.append(f"the pose is given in several frames: {some_names(found.parents, 10)}")
-    order = np.flatnonzero(usable)[np.argsort(found.t_ns[usable], kind="stable")]
-    parent = next(iter(found.parents), "")
+    if len(trajectory.parents) > 1:
+        warnings.append(
+            f"the pose is given in several frames: {some_names(trajectory.parents, 10)}"
+        )
+    order = np.flatnonzero(usable)[np.argsort(trajectory.t_ns[usable], kind="stable")]
+    parent = next(iter(trajectory.parents), "")
     with (
         part_file(output) as part,
         progress(f"export {output.name}", len(order)) as bar,
         part.open("w", encoding="utf-8", newline="\n") as stream,
     ):
-        names = plain(f"pose of {found.frame} in {parent or 'an unnamed frame'}")
-        stream.write(f"# {names}, from {plain(found.topic)}\n")
+        names = plain(f"pose of {trajectory.frame} in {parent or 'an unnamed frame'}")
+        stream.write(f"# {names}, from {plain(trajectory.topic)}\n")
         stream.write("# timestamp tx ty tz qx qy qz qw\n")
         for start in range(0, len(order), _LINES_PER_BLOCK):
             rows = order[start : start + _LINES_PER_BLOCK]
-            stream.writelines(_lines(found.t_ns[rows], found.poses[rows]))
+            stream.writelines(_lines(trajectory.t_ns[rows], trajectory.poses[rows]))
             bar.update(start)
             check_stop(output, stop)
-    what = f"{len(order)} poses of {found.frame} in {parent}, from {found.topic}"
-    facts = {"poses": len(order), "frame": found.frame, "parent": parent, "topic": found.topic}
+    what = f"{len(order)} poses of {trajectory.frame} in {parent}, from {trajectory.topic}"
+    facts = {
+        "poses": len(order),
+        "frame": trajectory.frame,
+        "parent": parent,
+        "topic": trajectory.topic,
+    }
     return ExportReport(what, facts, warnings)
 
 
@@ -181,17 +190,17 @@ def _of_transforms(
     for topic in topics:
         shift_ns: int | None = None
         for log_ns, message in session.messages(topic):
-            for each in message.transforms:
-                names[each.child_frame_id] = None
-                if each.child_frame_id != frame:
+            for transform in message.transforms:
+                names[transform.child_frame_id] = None
+                if transform.child_frame_id != frame:
                     continue
-                stamp_ns = each.header.stamp.sec * NS + each.header.stamp.nanosec
+                stamp_ns = transform.header.stamp.sec * NS + transform.header.stamp.nanosec
                 if shift_ns is None:
                     shift_ns = clock_shift_ns(stamp_ns, log_ns)
                 where = where or topic
                 times.append(stamp_ns + shift_ns)
-                parents[each.header.frame_id] = None
-                t, q = each.transform.translation, each.transform.rotation
+                parents[transform.header.frame_id] = None
+                t, q = transform.transform.translation, transform.transform.rotation
                 poses.append([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
     if frame is None or not times:
         return None, list(names)

@@ -48,7 +48,7 @@ def find_apart(
     gains = _apart(np.array([exposure.responses[k].gain for k in kept]), 0.0)
     common = median_response([exposure.responses[k] for k in kept])
     slopes = _apart(np.array([_slope(course, common, k) for k in kept]), 0.0)
-    found = [Apart(names[kept[i]], "lag", *each) for i, each in lags.items()]
+    found = [Apart(names[kept[i]], "lag", *lag) for i, lag in lags.items()]
     found += [Apart(names[kept[i]], "gain", *gains[i]) for i in gains if i in slopes]
     return found
 

@@ -85,7 +85,7 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[t
     starts = width * np.arange(count, dtype=np.int64)
     rows = [rows_of(course, exposure, usable[k], k) for k in range(joints)]
     moments = [moments_of(r * usable[k], r, starts, width) for k, r in enumerate(rows)]
-    breaks = [breaks_of(each) for each in moments]
+    breaks = [breaks_of(moment) for moment in moments]
     block_s = width * course.step_s
     found: list[tuple[float, Jump]] = []
     for k, own in enumerate(breaks):
@@ -111,23 +111,25 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[t
     return found
 
 
-def _beside(own: Breaks, others: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _beside(breaks: Breaks, others: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return changes and their errors, without what like joints do at the same time."""
     if len(others) < ENOUGH_LIKE - 1:
-        return own.change, own.error
+        return breaks.change, breaks.error
     middle = np.median(others, axis=0)
     spread = ROBUST * np.median(np.abs(others - middle), axis=0)
-    return own.change - middle, np.hypot(own.error, spread / np.sqrt(len(others)))
+    return breaks.change - middle, np.hypot(breaks.error, spread / np.sqrt(len(others)))
 
 
-def _unexpected(own: Breaks, change: FloatArray, compared: bool, command: FloatArray) -> BoolArray:
+def _unexpected(
+    breaks: Breaks, change: FloatArray, compared: bool, command: FloatArray
+) -> BoolArray:
     """Mark the changes that healthy joints don't have, shape (3, b - 1)."""
     unexpected = np.ones(change.shape, dtype=np.bool_)
     if not compared:  # a soft servo rests elsewhere in another posture
         unexpected[0] = np.abs(change[0]) > LARGEST_REST_RAD
     if is_sweep(command):  # another time is another frequency, to which each joint responds
         least = np.array([[QUARTER], [LIKE_LAG_S]])
-        unexpected[1:] = (np.abs(change[1:]) > least) & (own.freedom[1:] >= FEWEST) & compared
+        unexpected[1:] = (np.abs(change[1:]) > least) & (breaks.freedom[1:] >= FEWEST) & compared
     return unexpected
 
 

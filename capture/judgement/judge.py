@@ -240,7 +240,11 @@ def _naming(
     naming = permutation_of(course.command.T, course.position.T, course.step_s)
     names = [motion.name for motion in driven]
     if naming.verdict is Verdict.EITHER:
-        named = [one.delay_s for one in naming.alternatives if one.kind is Kind.AS_NAMED]
+        named = [
+            alternative.delay_s
+            for alternative in naming.alternatives
+            if alternative.kind is Kind.AS_NAMED
+        ]
         # Lags that servos have are no reason to doubt the names.
         usual = named and min(named) <= LATEST_S
         return "" if usual or _explain_more(exposure, naming) else in_words(naming, names), {}
@@ -260,13 +264,13 @@ def _explain_more(exposure: Exposure, naming: Naming) -> bool:
     As with two kinds of servos, whose gains and lags differ; a few joints' own lags and other names
     for them can't be told apart.
     """
-    for one in naming.alternatives:
-        if one.kind is Kind.PERMUTED:
-            moved = [k for k, j in enumerate(one.permutation) if k != j]
+    for alternative in naming.alternatives:
+        if alternative.kind is Kind.PERMUTED:
+            moved = [k for k, j in enumerate(alternative.permutation) if k != j]
             own = [exposure.responses[k] for k in moved]
-            if len(moved) < WHOLE * len(one.permutation) or not all(map(responds, own)):
+            if len(moved) < WHOLE * len(alternative.permutation) or not all(map(responds, own)):
                 return False
-            if any(r.explained < one.explained[k] for k, r in zip(moved, own, strict=True)):
+            if any(r.explained < alternative.explained[k] for k, r in zip(moved, own, strict=True)):
                 return False
     return True
 

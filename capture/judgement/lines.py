@@ -74,12 +74,12 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     begun = int(np.median(np.argmax(usable, axis=1)))
     end = usable.shape[1]
     middle = (begun + end) // 2
-    found: dict[int, Line] = {}
+    lines: dict[int, Line] = {}
     for first, last in ((begun, end), (begun, middle), (middle, end)):
         if last - first >= FEWEST:
             for line in _lines(course, exposure, usable, slice(first, last)):
-                found.setdefault(line.joint, line)
-    return [found[k] for k in sorted(found)]
+                lines.setdefault(line.joint, line)
+    return [lines[k] for k in sorted(lines)]
 
 
 def _lines(course: Course, exposure: Exposure, usable: BoolArray, part: slice) -> list[Line]:

@@ -148,7 +148,7 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
     if np.median(at_once) >= FOLLOWS:
         return Naming(Verdict.FITS, (named,), (), alike)
     # The lag as named is large: names that are shifted would leave a smaller one.
-    shifted = [one for one in _shifts(pairs) if one.delay_s < named.delay_s]
+    shifted = [shift for shift in _shifts(pairs) if shift.delay_s < named.delay_s]
     earlier = sorted((one for one in shifted if _as_good(one, named)), key=lambda one: one.delay_s)
     verdict = Verdict.EITHER if earlier else Verdict.FITS
     return Naming(verdict, (*earlier, named), (), alike)
@@ -173,7 +173,7 @@ def _permuted(
     if not along and (few or np.mean(gained[moved] > AS_GOOD) < WHOLE):
         return fits
     rivals = [one for one in regular if _as_good(one, best)]
-    rivals = [one for one in rivals if one.permutation != best.permutation]
+    rivals = [rival for rival in rivals if rival.permutation != best.permutation]
     if decided_by:
         inverted = _inverted(pairs, named, decided_by)
         lost = best.explained - inverted.explained
@@ -191,9 +191,9 @@ def _permuted(
     return Naming(verdict, tuple(standing), decided_by, alike)
 
 
-def _fits_in(one: Explanation, joint: int) -> bool:
+def _fits_in(explanation: Explanation, joint: int) -> bool:
     """Whether a joint is explained as well as the others: alone it has to be to decide."""
-    return float(np.median(one.explained) - one.explained[joint]) <= 2 * AS_GOOD
+    return float(np.median(explanation.explained) - explanation.explained[joint]) <= 2 * AS_GOOD
 
 
 def _simplest(pairs: Pairs, named: Explanation, others: Sequence[Explanation]) -> Explanation:
@@ -234,8 +234,8 @@ def _cycles(permutation: Sequence[int]) -> Iterator[list[int]]:
         yield cycle
 
 
-def _total(one: Explanation) -> float:
-    return float(one.explained.sum())
+def _total(explanation: Explanation) -> float:
+    return float(explanation.explained.sum())
 
 
 def _deciding(better: Explanation, other: Explanation) -> tuple[int, ...]:
@@ -244,11 +244,13 @@ def _deciding(better: Explanation, other: Explanation) -> tuple[int, ...]:
     return tuple(np.flatnonzero(clear).tolist())
 
 
-def _as_good(one: Explanation, best: Explanation) -> bool:
+def _as_good(explanation: Explanation, best: Explanation) -> bool:
     """Whether no joint decides against an explanation, nor do those that differ together."""
-    differs = np.array(one.permutation) != np.array(best.permutation)
-    loss = best.explained - one.explained
-    return not _deciding(best, one) and float(loss[differs].sum()) <= AS_GOOD * differs.sum()
+    differs = np.array(explanation.permutation) != np.array(best.permutation)
+    loss = best.explained - explanation.explained
+    return (
+        not _deciding(best, explanation) and float(loss[differs].sum()) <= AS_GOOD * differs.sum()
+    )
 
 
 def _candidates(pairs: Pairs) -> list[Explanation]:
@@ -335,15 +337,15 @@ def in_words(naming: Naming, names: Sequence[str]) -> str:
     decided = naming.decided_by or next((a.moved for a in naming.alternatives if a.moved), ())
     several = some_names([names[k] for k in decided], NAMED)
     clauses: list[str] = []
-    for one in naming.alternatives:
-        if one.kind is Kind.AS_NAMED:
-            clauses.append(f"all joints lag by {one.delay_s:.3g} s")
-        elif one.kind is Kind.INVERTED:
+    for alternative in naming.alternatives:
+        if alternative.kind is Kind.AS_NAMED:
+            clauses.append(f"all joints lag by {alternative.delay_s:.3g} s")
+        elif alternative.kind is Kind.INVERTED:
             clauses.append(f"inverted: {several}")
-        elif one.kind is Kind.OWN_LAGS:
+        elif alternative.kind is Kind.OWN_LAGS:
             clauses.append(f"another lag or gain than the other joints have: {several}")
         else:
-            clauses.append(_order_in_words(one.permutation, names))
+            clauses.append(_order_in_words(alternative.permutation, names))
     return ", or ".join(clauses)
 
 

@@ -259,15 +259,15 @@ def _merit(fit: _Fit) -> tuple[float, int, float]:
 
 def _moved(centre: Response, step_s: float, latest_s: float, slowest_s: float) -> list[Response]:
     """Return the neighbours of a response, a step of delay or time constant away."""
-    found: list[Response] = []
+    responses: list[Response] = []
     for k in (-1, 0, 1):
         for j in (-1, 0, 1) if centre.order else (0,):
             delay = min(max(centre.delay_s + k * step_s, 0.0), latest_s)
             slowest = slowest_s / max(centre.order, 1)
             constant = min(max(centre.constant_s + j * step_s, 0.0), slowest)
             if k or j:
-                found.append(replace(centre, delay_s=delay, constant_s=constant))
-    return found
+                responses.append(replace(centre, delay_s=delay, constant_s=constant))
+    return responses
 
 
 def _parts(size: int) -> IntArray:

@@ -268,7 +268,7 @@ def recover_log(
                 raise DataError(f"{path}: no message of it can be read")
             report = RecoverReport(
                 output=output,
-                sources=[{**source.facts, "path": str(each)} for each in source.paths],
+                sources=[{**source.facts, "path": str(path)} for path in source.paths],
                 **log.measures(),
                 warnings=source.warnings,
                 from_wal=found.from_wal if found is not None else 0,

@@ -166,7 +166,7 @@ class RawLog(Closing):
             self.warn(f"{error}; its messages are missing")
             return
         loose = not block.start  # the unchunked messages lie between other records
-        offsets = (at for found in (block.offsets or {}).values() for at in found.tolist())
+        offsets = (at for offset in (block.offsets or {}).values() for at in offset.tolist())
         places = sorted(offsets) if loose else self._places(block, data, start, stop)
         unknown = 0
         for at in places:

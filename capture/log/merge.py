@@ -202,7 +202,10 @@ def merge_logs(
             log.write_all(
                 f"merging {len(sources)} logs",
                 ((channel_id, message) for _, channel_id, message in merged),
-                (min(each.start_ns for each in sources), max(each.end_ns for each in sources)),
+                (
+                    min(source.start_ns for source in sources),
+                    max(source.end_ns for source in sources),
+                ),
                 stop,
             )
             if log.first_ns is None:
@@ -254,7 +257,7 @@ def _refuse_other_types(sources: Sequence[RawLog]) -> None:
     """Refuse topics of one name with different types or units."""
     faults: list[str] = []
     for (one, kinds), (other, others) in combinations(
-        [(each, _kinds(each)) for each in sources], 2
+        [(source, _kinds(source)) for source in sources], 2
     ):
         for topic in sorted(kinds.keys() & others.keys()):
             this, that = kinds[topic], others[topic]
@@ -287,10 +290,10 @@ class _Kind:
 
 
 def _kinds(source: RawLog) -> dict[str, _Kind]:
-    found: dict[str, _Kind] = {}
+    kinds: dict[str, _Kind] = {}
     definitions = {key: _definition(schema) for key, schema in source.file.schemas.items()}
     for channel in source.file.channels.values():
-        kind = found.setdefault(channel.topic, _Kind())
+        kind = kinds.setdefault(channel.topic, _Kind())
         schema = source.file.schemas.get(channel.schema_id)
         coding = channel.message_encoding, schema.encoding if schema is not None else ""
         name = source.type_name(channel) or "without a type"
@@ -298,7 +301,7 @@ def _kinds(source: RawLog) -> dict[str, _Kind]:
         kind.definitions.add((name, coding, definitions.get(channel.schema_id)))
         if channel.metadata.get("unit"):
             kind.units.add(channel.metadata["unit"])
-    return found
+    return kinds
 
 
 def _definition(schema: Schema) -> object:
@@ -343,7 +346,9 @@ def _joint_names(source: RawLog) -> set[str]:
 
 def _apart(sources: Sequence[RawLog], *, allowed: bool) -> Iterator[str]:
     """Warn of logs with time between them, and refuse those that are far apart."""
-    ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
+    ordered = sorted(
+        (source for source in sources if source.end_ns), key=lambda each: each.start_ns
+    )
     for k, later in enumerate(ordered[1:], start=1):
         earlier = max(ordered[:k], key=lambda each: each.end_ns)
         gap_s = (later.start_ns - earlier.end_ns) / NS

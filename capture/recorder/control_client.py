@@ -161,11 +161,11 @@ def _is_in_use(path: Path) -> bool:
 
 def _sockets_below(folder: Path) -> list[Path]:
     """Return the sockets in a folder and in its folders (of services)."""
-    found: list[Path] = []
+    paths: list[Path] = []
     for pattern in (f"*{_SUFFIX}", f"*/*{_SUFFIX}"):
         with suppress(OSError):  # no such folder, or not readable
-            found += [path for path in folder.glob(pattern) if path.is_socket()]
-    return found
+            paths += [path for path in folder.glob(pattern) if path.is_socket()]
+    return paths
 
 
 @contextmanager

@@ -148,7 +148,7 @@ def read_records(data: bytes) -> list[LiveMessage | Definition]:
     Raises:
         DataError: If it is cut short or a definition can't be read.
     """
-    found: list[LiveMessage | Definition] = []
+    messages: list[LiveMessage | Definition] = []
     at = HEAD_SIZE
     while at < len(data):
         start = at + RECORD_SIZE
@@ -162,10 +162,12 @@ def read_records(data: bytes) -> list[LiveMessage | Definition]:
             raise DataError("a datagram of the live feed is cut short")
         payload = data[start:at]
         if kind == Opcode.MESSAGE:
-            found.append(LiveMessage(channel_id, sequence, log_ns, publish_ns, offered_ns, payload))
+            messages.append(
+                LiveMessage(channel_id, sequence, log_ns, publish_ns, offered_ns, payload)
+            )
         else:
-            found.append(_description(kind, payload))
-    return found
+            messages.append(_description(kind, payload))
+    return messages
 
 
 def _description(kind: int, payload: bytes) -> Definition:
@@ -223,7 +225,7 @@ class LiveDefinitions:
         states = [pack_message(state) for state in self.states.values() if state is not None]
         groups: list[list[bytes]] = []
         filled = 0
-        for packed in [*self._packed.values(), *(one for one in states if len(one) <= size)]:
+        for packed in [*self._packed.values(), *(state for state in states if len(state) <= size)]:
             if not groups or filled + len(packed) > size:
                 groups.append([])
                 filled = 0

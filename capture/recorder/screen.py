@@ -90,7 +90,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
         height: Most lines; topics that don't fit are counted. None for no limit.
     """
     head = [*_headline(snapshot, width), *_verdict(snapshot, width)]
-    cells = [_source_cells(each) for each in snapshot.sources]
+    cells = [_source_cells(source) for source in snapshot.sources]
     sources, _ = table(SOURCE_COLUMNS, cells, width, cropped=True)
     events = [_event(event, snapshot, width) for event in snapshot.events[-_EVENTS:]]
     if events:

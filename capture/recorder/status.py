@@ -273,26 +273,26 @@ def combined(name: str, topics: Sequence[TopicSnapshot]) -> TopicSnapshot:
     """Combine topics into one: sums of the counts and rates, the worst of the other values."""
 
     def known(key: str) -> list[Any]:
-        return [value for each in topics if (value := getattr(each, key)) is not None]
+        return [value for topic in topics if (value := getattr(topic, key)) is not None]
 
     def total(key: str) -> int | None:
         return sum(known(key)) if known(key) else None
 
     def joints(key: str) -> tuple[str, ...]:
-        return tuple(sorted({joint for each in topics for joint in getattr(each, key)}))
+        return tuple(sorted({joint for topic in topics for joint in getattr(topic, key)}))
 
     return TopicSnapshot(
         topic=name,
-        count=sum(each.count for each in topics),
+        count=sum(topic.count for topic in topics),
         rate_hz=math.fsum(known("rate_hz")) if known("rate_hz") else None,
-        age_s=max(each.age_s for each in topics),
+        age_s=max(topic.age_s for topic in topics),
         gaps=total("gaps"),
         missing=total("missing"),
         jitter=max(known("jitter"), default=None),
         dropped=total("dropped"),
         at_limit=joints("at_limit"),
         frozen=joints("frozen"),
-        nan=sum(each.nan for each in topics),
+        nan=sum(topic.nan for topic in topics),
     )
 
 

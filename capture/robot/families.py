@@ -323,7 +323,7 @@ def read_family(
     databases = tuple(
         (f"{family}-{way}.dbc", dbc_text(of_way))
         for way in Direction
-        if (of_way := {name: each for name, each in frames.items() if each.direction is way})
+        if (of_way := {name: frame for name, frame in frames.items() if frame.direction is way})
     )
     names_of = tuple(name for name, _ in databases)
     return Bus(names_of, bitrate, signals, family=family, motors=motors), databases

@@ -82,7 +82,7 @@ class NullModel:
     @property
     def reach(self) -> FloatArray:
         """Largest abs(x) for which the model holds, shape (K,)."""
-        return np.array([one.reach for one in self.parameters])
+        return np.array([parameter.reach for parameter in self.parameters])
 
     def error_at(self, x: FloatArray) -> float:
         """Return the error of the model, in proportion to the distance from its reference.
@@ -125,12 +125,12 @@ def write_null_model(path: Path, model: NullModel) -> None:
             "amplitude_rad": np.abs(model.command).tolist(),
             "phase_rad": np.angle(model.command).tolist(),
         },
-        "parameters": [write(one) for one in model.parameters],
+        "parameters": [write(parameter) for parameter in model.parameters],
         "covariance": model.covariance.tolist(),
         "response": _pair(model.response),
         "slope": _pair(model.slope),
         "curvature": _pair(model.curvature),
-        "modules": [{"kind": kind, **_pair(one)} for kind, one in model.modules.items()],
+        "modules": [{"kind": kind, **_pair(module)} for kind, module in model.modules.items()],
         "error": model.error,
         "made_by": model.made_by,
     }
@@ -160,7 +160,7 @@ def read_null_model(path: Path) -> NullModel:
     m = len(joints)
     amplitude = _array(gait, "amplitude_rad", (m,))
     phase = _array(gait, "phase_rad", (m,))
-    parameters = tuple(read(one, SharedParameter) for one in top.tables("parameters"))
+    parameters = tuple(read(table, SharedParameter) for table in top.tables("parameters"))
     k = len(parameters)
     model = NullModel(
         robot=read_field(top, NullModel, "robot"),
@@ -172,7 +172,7 @@ def read_null_model(path: Path) -> NullModel:
         response=_complex(top, "response", (m,)),
         slope=_complex(top, "slope", (k, m)),
         curvature=_complex(top, "curvature", (k, k, m)),
-        modules=dict(_module(one, m) for one in top.tables("modules")),
+        modules=dict(_module(table, m) for table in top.tables("modules")),
         error=read_field(top, NullModel, "error"),
         made_by=read_field(top, NullModel, "made_by"),
     )

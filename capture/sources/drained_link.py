@@ -62,13 +62,13 @@ class DrainedLink:
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
         """See :meth:`Link.read`."""
         error = self._error  # before the frames: none comes after it
-        found: list[FrameArray] = []
+        arrays: list[FrameArray] = []
         while self._held:
-            found.append(self._held.popleft())
-            self._taken += len(found[-1])
-        if not found and error is not None:
+            arrays.append(self._held.popleft())
+            self._taken += len(arrays[-1])
+        if not arrays and error is not None:
             raise error
-        return found
+        return arrays
 
     def close(self) -> None:
         """End the thread and close the link."""

@@ -341,20 +341,20 @@ class ReceiveThread:
             rows.count = None
             self._free.append(rows)
         self._used.clear()
-        found: list[Batch] = []
+        batches: list[Batch] = []
         while self._filled and most > 0:
             rows = self._filled[0]
             count = rows.count
             stop = rows.room.arrived(self._read) if count is None else count
             if stop > self._read:
-                found.append(rows.room.batch(self._read, stop))
+                batches.append(rows.room.batch(self._read, stop))
                 most -= stop - self._read
                 self._read = stop
             if count is None:
                 break
             self._used.append(self._filled.popleft())
             self._read = 0
-        return found
+        return batches
 
     def end(self) -> None:
         """Receive no more: local senders get an error; received packets are kept."""

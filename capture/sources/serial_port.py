@@ -224,12 +224,12 @@ class TapLink:
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
         """See :meth:`Link.read`."""
         error = self._error
-        found: list[FrameArray] = []
+        arrays: list[FrameArray] = []
         while self._held:
-            found.append(self._held.popleft())
-        if not found and error is not None:
+            arrays.append(self._held.popleft())
+        if not arrays and error is not None:
             raise error
-        return found
+        return arrays
 
     def close(self) -> None:
         """End the thread, close both ports and remove the link."""

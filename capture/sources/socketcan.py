@@ -91,7 +91,7 @@ class SocketcanLink:
         """See :meth:`Link.read`."""
         if self._error is not None:
             raise self._error
-        found: list[FrameArray] = []
+        arrays: list[FrameArray] = []
         most = _MOST_BATCHES
         while most:
             most -= 1
@@ -106,17 +106,17 @@ class SocketcanLink:
             if len(batch.sizes):
                 times = self._clock.times(batch.stamps_ns, self._floor_ns)
                 self._floor_ns = times[-1]
-                found.append(frames_of(batch, times))
+                arrays.append(frames_of(batch, times))
                 if CANFD_MTU in batch.sizes:
-                    found.append(frames_of(batch, times, fd=True))
+                    arrays.append(frames_of(batch, times, fd=True))
                 self._count(batch)
             else:
                 self._floor_ns = looked_ns
             if len(batch.sizes) < self._receive.capacity:
                 break
-        if not found and self._error is not None:
+        if not arrays and self._error is not None:
             raise self._error
-        return found
+        return arrays
 
     def fileno(self) -> int:
         """The socket."""

@@ -125,14 +125,14 @@ def _one_by_one(
 
 def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     """Read one message; None if it is no frame."""
-    found = _ANY.fullmatch(message)
-    if found is None:
+    match = _ANY.fullmatch(message)
+    if match is None:
         if (error := _ERROR.fullmatch(message)) is not None:
             tally.events.log_event("warn", f"the server answered: {error[1]!r}")
         elif not _WORD.fullmatch(message):
             tally.malformed("malformed message", 1)
         return None
-    kind, digits, stamp, rest = found.groups(default="")
+    kind, digits, stamp, rest = match.groups(default="")
     identifier = int(digits, 16)
     if kind == "error":  # the server keeps the details to itself
         flags = identifier & ID_MASK | ERROR_FLAG
@@ -159,11 +159,11 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
 
 def _time_ns(stamp: str, t_host_ns: int, tally: Tally) -> int:
     """A frame's time; that of its arrival where the server's is negative, infinite or too long."""
-    found = _TIME.fullmatch(stamp)
-    if found is None:
+    match = _TIME.fullmatch(stamp)
+    if match is None:
         tally.malformed(IMPLAUSIBLE_TIME, 1)
         return t_host_ns
-    seconds, fraction = found.groups(default="")
+    seconds, fraction = match.groups(default="")
     return int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))
 
 

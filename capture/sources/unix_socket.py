@@ -170,17 +170,17 @@ class UnixSource:
             return Polled((), self._tally.events.flush())
         while self._new:
             self._add(self._new.popleft())
-        found: list[FrameArray] = []
+        arrays: list[FrameArray] = []
         with_frames = 0
         if self._out_of_step():
             return Polled((), self._tally.events.take())
         for sender in tuple(self._senders):
-            before = len(found)
-            self._drain(sender, found)
-            with_frames += len(found) > before
-        if not found:
+            before = len(arrays)
+            self._drain(sender, arrays)
+            with_frames += len(arrays) > before
+        if not arrays:
             return Polled((), self._tally.events.take())
-        frames = found[0] if len(found) == 1 else np.concatenate(found)
+        frames = arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
         if with_frames > 1:
             frames = frames[np.argsort(frames["t_host_ns"], kind="stable")]
         self._tally.counts.frames += len(frames)
@@ -237,7 +237,7 @@ class UnixSource:
         self._tally.counts.reconnects += back
         self._tally.events.log_event("info", "a sender is back" if back else "a sender connected")
         self._senders.append(sender)
-        stay = [each for each in self._senders if not each.leaves]
+        stay = [sender for sender in self._senders if not sender.leaves]
         if len(stay) > MOST_SENDERS:
             longest = min(stay, key=lambda each: (each.active, each.last_ns))
             text = f"more than {MOST_SENDERS} senders: the one silent for longest is disconnected"
@@ -251,7 +251,7 @@ class UnixSource:
             return False
         now = time.monotonic()
         deadline = now + _ORDER_S
-        while any(each.receiver.pending for each in self._senders):
+        while any(sender.receiver.pending for sender in self._senders):
             if time.monotonic() >= deadline:
                 self._waits_since = self._waits_since or now
                 return now - self._waits_since < _MOST_WAIT_S
@@ -259,7 +259,7 @@ class UnixSource:
         self._waits_since = 0.0
         return False
 
-    def _drain(self, sender: _Sender, found: list[FrameArray]) -> None:
+    def _drain(self, sender: _Sender, arrays: list[FrameArray]) -> None:
         """Take a sender's packets; remove it if it has disconnected."""
         looked_ns = self._tally.now_ns()
         pending = sender.receiver.pending  # before: what isn't taken then comes later
@@ -270,7 +270,7 @@ class UnixSource:
             sender.floor_ns = times[-1]
             frames = self._unpack(sender, batch, times)
             if len(frames):
-                found.append(frames)
+                arrays.append(frames)
                 sender.active, sender.last_ns = True, times[-1]
         if not batches and not pending:  # after a stop of this process, packets may wait for long
             sender.floor_ns = max(sender.floor_ns, looked_ns - _LATEST_NS)

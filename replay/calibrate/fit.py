@@ -218,9 +218,9 @@ def _ends(solution: Solution, others: Sequence[Alternative]) -> tuple[FloatArray
     """Ends of the 95 % intervals of x: of this law, and of those that could be the ground's."""
     half = half_widths(solution.covariance)
     low, high = solution.x - half, solution.x + half
-    for one in others:
-        if one.widens:
-            wide, there = half_widths(one.covariance), solution.x + one.shift
+    for other in others:
+        if other.widens:
+            wide, there = half_widths(other.covariance), solution.x + other.shift
             low, high = np.minimum(low, there - wide), np.maximum(high, there + wide)
     return low, high
 

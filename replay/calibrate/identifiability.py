@@ -110,7 +110,7 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
     """
     spread = np.array([one.spread for one in unknowns])
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
-    found: list[CorrelatedParameters] = []
+    parameters: list[CorrelatedParameters] = []
     for k in np.argsort(values)[::-1].tolist():
         left = float(np.sqrt(max(values[k], 0.0)))
         if left <= _RIDGE:
@@ -120,8 +120,8 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
         order: list[int] = np.argsort(-np.abs(way)).tolist()
         moved = [(unknowns[i], float(way[i])) for i in order if abs(way[i]) > _MOVED]
         factors = {one.label: one.value(size) / (one.start or 1.0) for one, size in moved}
-        found.append(CorrelatedParameters(left, factors))
-    return tuple(found)
+        parameters.append(CorrelatedParameters(left, factors))
+    return tuple(parameters)
 
 
 def suggested_recordings(

@@ -136,11 +136,12 @@ class LackOfFit:
     @property
     def p(self) -> float:
         """Of 'the twin fits', family-wise over joints, other laws and all checks."""
-        checks = [len(self.joints) * min(one.p for one in self.joints.values())]
+        checks = [len(self.joints) * min(joint.p for joint in self.joints.values())]
         if self.unfitted is not None:
             checks.append(self.unfitted.p)
         kinds = (
-            [one.p for one in self.alternatives if one.widens is laws] for laws in (True, False)
+            [alternative.p for alternative in self.alternatives if alternative.widens is laws]
+            for laws in (True, False)
         )
         checks += [len(others) * min(others) for others in kinds if others]
         return min(1.0, len(checks) * min(checks))
@@ -184,15 +185,15 @@ def lack_of_fit(
         unfitted: From :func:`halves`.
         others: From :func:`.replay.calibrate.identifiability.alternatives`.
     """
-    found: dict[str, JointFit] = {}
+    fits: dict[str, JointFit] = {}
     rows = zip(measured.joints, measured.times_s, measured.angles, residuals, omegas, strict=True)
     for joint, t, angle, rest, omega in rows:
         if omega is not None and float(t[-1] - t[0]) * omega / (2 * np.pi) >= FEWEST_CYCLES:
-            found[joint] = periodic(t, rest, omega, step_of(angle))
+            fits[joint] = periodic(t, rest, omega, step_of(angle))
         else:
-            found[joint] = JointFit(ljung_box(rest), None)
+            fits[joint] = JointFit(ljung_box(rest), None)
     gaits = tuple({omega / (2 * np.pi): None for omega in omegas if omega is not None})
-    return LackOfFit(found, unfitted, others, gaits)
+    return LackOfFit(fits, unfitted, others, gaits)
 
 
 def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.0) -> JointFit:

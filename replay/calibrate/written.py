@@ -53,11 +53,15 @@ def _robot_text(calibration: Calibration) -> str:
     head = [f"# {robot.name}, its servo fitted to {names}."]
     if calibration.lack.found:
         head.append("# The twin does not fit that session: what follows has no interval.")
-    for one in calibration.parameters:
-        unit = "" if one.unit == "1" else f" {one.unit}"
-        known = "" if one.determined else "; not determined by this session"
-        within = "" if one.ci95 is None else f", 95 % {one.ci95[0]:.4g} to {one.ci95[1]:.4g}"
-        head.append(f"# {one.label}: {one.value:.4g}{unit}{within}{known}")
+    for parameter in calibration.parameters:
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        known = "" if parameter.determined else "; not determined by this session"
+        within = (
+            ""
+            if parameter.ci95 is None
+            else f", 95 % {parameter.ci95[0]:.4g} to {parameter.ci95[1]:.4g}"
+        )
+        head.append(f"# {parameter.label}: {parameter.value:.4g}{unit}{within}{known}")
     text = "\n".join([*head, "", tomlkit.dumps(values)])
     parse_robot(text, "fitted robot", dict(robot.databases))  # it can be read back
     return text
@@ -71,7 +75,7 @@ def _scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pa
         scenario_file: Where the scenario will be.
     """
     scenario = calibration.scenario
-    modules = {one.module for one in calibration.parameters}
+    modules = {parameter.module for parameter in calibration.parameters}
     fitted = [joint for joint in scenario.robot.joints if joint.name in modules]
     own = {joint.name: {"stall_torque": joint.servo.stall_torque} for joint in fitted}
     return replace(

@@ -143,8 +143,8 @@ def _summary(calibration: Calibration) -> Iterator[str]:
         yield "The fit did not come to an end: take its numbers as a step on the way."
     fits = not calibration.lack.found
     yield "Parameters (95 % interval; before):" if fits else "Parameters (no interval; before):"
-    width = max(len(one.label) for one in calibration.parameters)
-    yield from (f"  {_parameter(one, width)}" for one in calibration.parameters)
+    width = max(len(parameter.label) for parameter in calibration.parameters)
+    yield from (f"  {_parameter(parameter, width)}" for parameter in calibration.parameters)
     if fits:
         yield from _undetermined(calibration)
     yield from _search(calibration)
@@ -167,11 +167,13 @@ def _facts(calibration: Calibration) -> dict[str, Any]:
         "sessions": list(calibration.sessions),
         "world": calibration.world,
         "parameters": [
-            {key: value for key, value in vars(one).items() if key != "label"}
-            for one in calibration.parameters
+            {key: value for key, value in vars(parameter).items() if key != "label"}
+            for parameter in calibration.parameters
         ],
-        "undetermined": [one.label for one in calibration.parameters if not one.determined],
-        "ridges": [vars(one) for one in calibration.ridges],
+        "undetermined": [
+            parameter.label for parameter in calibration.parameters if not parameter.determined
+        ],
+        "ridges": [vars(ridge) for ridge in calibration.ridges],
         "would_tell": list(calibration.would_tell),
         "search": None
         if search is None
@@ -188,8 +190,13 @@ def _facts(calibration: Calibration) -> dict[str, Any]:
             "gait_hz": lack.gaits_hz[0] if lack.gaits_hz else None,
             "joints": {joint: vars(one) for joint, one in lack.joints.items()},
             "alternatives": [
-                {"label": one.label, "size": one.size, "ci95": one.ci95, "p": one.p}
-                for one in lack.alternatives
+                {
+                    "label": alternative.label,
+                    "size": alternative.size,
+                    "ci95": alternative.ci95,
+                    "p": alternative.p,
+                }
+                for alternative in lack.alternatives
             ],
             "unfitted": None if lack.unfitted is None else vars(lack.unfitted),
         },
@@ -211,7 +218,7 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
     if (best := lack.explanation) is not None:
         taken = f"takes {100 * (1 - best.left):.0f} % of what is left"
         parts.append(f"{best.label} would fit better ({_size(best)}; {taken})")
-    if off := [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]:
+    if off := [j for j, joint in lack.joints.items() if len(lack.joints) * joint.p < LEVEL]:
         periodic = lack.joints[lack.worst].periodic_rad
         size = "" if periodic is None else f" by {periodic:.2g} rad (RMS)"
         how = "is no noise" if periodic is None else "comes back with every cycle"
@@ -251,7 +258,11 @@ def _checked(lack: LackOfFit) -> Iterator[str]:
         if not lack.unfitted.by_session:
             other_part = "each half under the parameters of the other"
         off = f"; {other_part} is {size:.3g} rad off"
-    if open_laws := [one.label for one in lack.alternatives if one.widens and one.could_be]:
+    if open_laws := [
+        alternative.label
+        for alternative in lack.alternatives
+        if alternative.widens and alternative.could_be
+    ]:
         yield (
             f"Not determined by this session: {' or '.join(open_laws)} would do as well; "
             "intervals have it in them."
@@ -266,26 +277,30 @@ def _p(p: float) -> str:
 def _rms(misfits: dict[str, Misfit]) -> float:
     import numpy as np
 
-    return float(np.sqrt(np.mean([one.rms**2 for one in misfits.values()])))
+    return float(np.sqrt(np.mean([misfit.rms**2 for misfit in misfits.values()])))
 
 
-def _parameter(one: Fitted, width: int) -> str:
+def _parameter(fitted: Fitted, width: int) -> str:
     from ..calibrate.parameters import DELAY
 
-    scale, unit = (1e3, "ms") if one.name == DELAY else (1.0, "" if one.unit == "1" else one.unit)
-    numbers = f"{scale * one.value:.4g}"
-    if one.ci95 is not None:
-        low, high = one.ci95
+    scale, unit = (
+        (1e3, "ms") if fitted.name == DELAY else (1.0, "" if fitted.unit == "1" else fitted.unit)
+    )
+    numbers = f"{scale * fitted.value:.4g}"
+    if fitted.ci95 is not None:
+        low, high = fitted.ci95
         numbers += f" [{scale * low:.4g}, {scale * high:.4g}]"
-    before = "" if one.name == DELAY else f"; {scale * one.start:.4g}"
-    open_ = "" if one.determined or one.ci95 is None else ", undetermined"
-    return f"{one.label:{width}}  {numbers} {unit}".rstrip() + before + open_
+    before = "" if fitted.name == DELAY else f"; {scale * fitted.start:.4g}"
+    open_ = "" if fitted.determined or fitted.ci95 is None else ", undetermined"
+    return f"{fitted.label:{width}}  {numbers} {unit}".rstrip() + before + open_
 
 
 def _undetermined(calibration: Calibration) -> Iterator[str]:
     from ..calibrate.parameters import DELAY
 
-    open_ones = [one.label for one in calibration.parameters if not one.determined]
+    open_ones = [
+        parameter.label for parameter in calibration.parameters if not parameter.determined
+    ]
     if not open_ones:
         return
     yield f"Undetermined by this session: {', '.join(open_ones)}."

@@ -250,11 +250,11 @@ def _view_session(
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
         session = topics.view(stack.enter_context(capture.Session.open(file, robot=robot)))
-        known = Layer(None)
+        layer = Layer(None)
         if single.result:
             from ..numbers import read_results
 
-            known = read_results(session, single.result)
+            layer = read_results(session, single.result)
         options = [viewer.WHOLE_IN_MEMORY] if web else []
         process = stack.enter_context(_open_viewer(*options, web=web))
         # Rerun would report a closed window as errors of its own, in colours.
@@ -268,7 +268,7 @@ def _view_session(
                 bar.update(0, note="the beginning")
                 # What is looked at goes before what is converted.
                 begun = partial(_be_nice, _NICENESS)
-                task = Task(session, known, analysing, single.tab or "session", bar, begun)
+                task = Task(session, layer, analysing, single.tab or "session", bar, begun)
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return

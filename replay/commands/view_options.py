@@ -70,5 +70,5 @@ class OverlayOptions:
 
 def given(options: SingleOptions | ClipOptions | OverlayOptions) -> str:
     """Return the options that were given, as they are typed, with commas."""
-    names = [one.name for one in fields(options) if getattr(options, one.name) is not None]
+    names = [field.name for field in fields(options) if getattr(options, field.name) is not None]
     return ", ".join(f"--{_TYPED.get(name, name.replace('_', '-'))}" for name in names)

@@ -376,7 +376,10 @@ class Drawing:
     def _written(self) -> Content:
         """Return the content that every window of samples has."""
         session = self._sources.session
-        units = {topic: one.metadata.get("unit", "rad") for topic, one in session.channels.items()}
+        units = {
+            topic: channel.metadata.get("unit", "rad")
+            for topic, channel in session.channels.items()
+        }
         return replace(
             self._plots.content(session.robot, units),
             start=None if self._head is None else start_of(self._head),

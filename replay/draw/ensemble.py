@@ -180,7 +180,7 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
         Their names, each once.
     """
     artefacts = () if analysis is None else analysis.artefacts
-    false = (one for one in artefacts if one.falsifies("position"))
+    false = (artefact for artefact in artefacts if artefact.falsifies("position"))
     return tuple(dict.fromkeys(one.joint for one in false if one.within(start_s, stop_s)))
 
 
@@ -270,15 +270,15 @@ def _cut(track: Track, pace: Pace) -> FloatArray:
     known: BoolArray = np.isfinite(phase) & np.isfinite(track.values)
     phase, values = phase[known], track.values[known]
     first = np.append(True, np.diff(phase) > 0) if phase.size else known[:0]
-    one = Series(track.name, phase[first], values[first])
+    series = Series(track.name, phase[first], values[first])
     nothing = np.zeros((0, PHASES))
-    if one.count < 3:
+    if series.count < 3:
         return nothing
-    model = allowed_model([one], 1.0)
-    if one.count <= model.size + 1 or 4 * one.period_s > np.pi:
+    model = allowed_model([series], 1.0)
+    if series.count <= model.size + 1 or 4 * series.period_s > np.pi:
         return nothing
-    fit, (start, stop) = fit_at([one], 1.0, model), pace.ends_rad
-    return cycles_by_phase(one, fit, 0, zero_rad=0.0, start_s=start, stop_s=stop)
+    fit, (start, stop) = fit_at([series], 1.0, model), pace.ends_rad
+    return cycles_by_phase(series, fit, 0, zero_rad=0.0, start_s=start, stop_s=stop)
 
 
 def _half(cut: FloatArray) -> FloatArray:

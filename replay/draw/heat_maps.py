@@ -62,7 +62,7 @@ def heat_maps(
         Gain, lag and power, those of them that are known.
     """
     place = {name: i + 1 for i, name in enumerate(names)}
-    found: list[HeatMap] = []
+    maps: list[HeatMap] = []
     for quantity in (GAIN, LAG, ENERGY):
         parts = [table for table in tables if table.quantity == quantity]
         if not parts:
@@ -75,8 +75,8 @@ def heat_maps(
             _settled(analysis, table), _LEAST[table.quantity.key], signed=quantity is ENERGY
         )
         places = tuple(place.get(name, i + 1) for i, name in enumerate(table.names))
-        found.append(HeatMap(table, places, low, high, quantity is ENERGY))
-    return tuple(found)
+        maps.append(HeatMap(table, places, low, high, quantity is ENERGY))
+    return tuple(maps)
 
 
 def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:

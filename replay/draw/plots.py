@@ -88,7 +88,7 @@ def log_others(
     Returns:
         A signal a topic; none for a session of undulog's own.
     """
-    found: list[Signal] = []
+    signals: list[Signal] = []
     left_out: list[str] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS:
@@ -104,10 +104,10 @@ def log_others(
             values = table.reindex(columns=list(lines)).to_numpy(np.float64)
             t_ns = table.index.to_numpy(dtype=np.int64)
             log_rows(rec, clock, entity, *mark_gaps(*ordered(t_ns, values)))
-        found.append(Signal(topic.lstrip("/"), (Series(entity, lines),), of_joints=False))
+        signals.append(Signal(topic.lstrip("/"), (Series(entity, lines),), of_joints=False))
     if left_out:
         warnings.append(f"not shown: {', '.join(left_out)}")
-    return tuple(found)
+    return tuple(signals)
 
 
 def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
@@ -164,7 +164,7 @@ def _lines(session: SessionView, topic: str) -> tuple[str, ...]:
     for table in _tables(session, topic):
         numbers = table.select_dtypes("number")
         columns = map(str, numbers.columns)
-        names = [one for one in columns if not any(word in one for word in _NOT_PLOTTED)]
+        names = [column for column in columns if not any(word in column for word in _NOT_PLOTTED)]
         moving = {name for name in names if numbers[name].nunique() > 1}
         chosen = sorted(names, key=lambda name: name not in moving)[:MOST_LINES]
         return tuple(name for name in names if name in chosen)
@@ -225,8 +225,8 @@ class Plot:
         self, rec: rr.RecordingStream, palette: Mapping[str, Color] | None, **look: Any
     ) -> None:
         """Write the style of its lines, as :func:`~.replay.draw.lines.log_look` takes it."""
-        for one in self.series:
-            log_look(rec, one.entity, one.names, palette, **look)
+        for series in self.series:
+            log_look(rec, series.entity, series.names, palette, **look)
 
     def write(
         self,
@@ -244,24 +244,24 @@ class Plot:
             known_ns: Until when samples are at hand [ns]; None where nothing comes after them.
         """
         by_name = {track.name: track for track in tracks}
-        for one in self.series:
-            own = [by_name[name] for name in one.names if name in by_name]
+        for series in self.series:
+            own = [by_name[name] for name in series.names if name in by_name]
             if not own:
                 continue
             table = join_tracks(own)
-            values = np.full((table.t_ns.size, len(one.names)), np.nan)
-            values[:, [one.names.index(name) for name in table.names]] = table.values
+            values = np.full((table.t_ns.size, len(series.names)), np.nan)
+            values[:, [series.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, known_ns)
-            drawn = rows(one.entity, t_ns)
+            drawn = rows(series.entity, t_ns)
             log_rows(
                 rec,
                 clock,
-                one.entity,
+                series.entity,
                 t_ns[drawn],
                 values[drawn],
                 degrees=self._degrees,
-                component=one.component,
-                steps=np.array([self._steps.get(name, 0.0) for name in one.names]),
+                component=series.component,
+                steps=np.array([self._steps.get(name, 0.0) for name in series.names]),
             )
 
 
@@ -290,12 +290,12 @@ class Plots:
         self._plots = {
             entity: Plot(
                 entity,
-                own,
+                part,
                 samples.get(entity, ()),
                 degrees=entity in _ANGLES,
                 component=DEGREES if entity in _ANGLES else SCALARS,
             )
-            for entity, own in parts.items()
+            for entity, part in parts.items()
         }
         self._places: dict[str, Plot] = {}
         for entity, plot in self._plots.items():
@@ -353,14 +353,16 @@ class Plots:
 
     def _signals(self, units: Mapping[str, str]) -> tuple[Signal, ...]:
         """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
-        found: list[Signal] = []
+        signals: list[Signal] = []
         topics = {topic_entity(SIGNALS, topic): topic for topic in units}
         for entity, plot in self._plots.items():
             if entity.startswith(f"{SIGNALS}/"):
                 topic = topics[entity]
-                of_joints = any(name in self._palette for one in plot.series for name in one.names)
-                found.append(Signal(signal_title(topic, units[topic]), plot.series, of_joints))
-        return tuple(found)
+                of_joints = any(
+                    name in self._palette for series in plot.series for name in series.names
+                )
+                signals.append(Signal(signal_title(topic, units[topic]), plot.series, of_joints))
+        return tuple(signals)
 
     def _add_places(
         self,
@@ -381,7 +383,7 @@ class Plots:
 
 def _colors(entity: str, plot: Plot, palette: Mapping[str, Color]) -> Mapping[str, Color]:
     """The joints' colours, or colours of its own for a signal that is not of the joints."""
-    names = [name for one in plot.series for name in one.names]
+    names = [name for series in plot.series for name in series.names]
     if entity.startswith(f"{SIGNALS}/") and not set(names) & set(palette):
         return joint_palette(names)
     return palette

@@ -113,7 +113,9 @@ def range_sensors(robot: Robot, topics: Collection[str]) -> tuple[Sensor, ...]:
         Infrared and ultrasound, in the robot's order.
     """
     kinds = (SensorKind.IR, SensorKind.SONAR)
-    return tuple(one for one in robot.sensors if one.kind in kinds and one.topic in topics)
+    return tuple(
+        sensor for sensor in robot.sensors if sensor.kind in kinds and sensor.topic in topics
+    )
 
 
 def log_rays(
@@ -214,23 +216,23 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
 
 def log_surroundings(rec: rr.RecordingStream, world: World) -> None:
     """Draw obstacles and target."""
-    cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
-    boxes = [_box(one) for one in world.obstacles if not isinstance(one, Cylinder)]
+    cylinders = [obstacle for obstacle in world.obstacles if isinstance(obstacle, Cylinder)]
+    boxes = [_box(obstacle) for obstacle in world.obstacles if not isinstance(obstacle, Cylinder)]
     if cylinders:
         shapes = rr.Cylinders3D(
-            lengths=[one.height for one in cylinders],
-            radii=[one.radius for one in cylinders],
-            centers=[(*one.position, one.height / 2) for one in cylinders],
+            lengths=[cylinder.height for cylinder in cylinders],
+            radii=[cylinder.radius for cylinder in cylinders],
+            centers=[(*cylinder.position, cylinder.height / 2) for cylinder in cylinders],
             colors=[_STONE],
             fill_mode=FillMode.Solid,
         )
         rec.log(CYLINDERS, shapes, static=True)
     if boxes:
         shapes = rr.Boxes3D(
-            sizes=[(*one.size, one.height) for one in boxes],
-            centers=[(*one.position, one.height / 2) for one in boxes],
+            sizes=[(*box.size, box.height) for box in boxes],
+            centers=[(*box.position, box.height / 2) for box in boxes],
             quaternions=[
-                (0.0, 0.0, math.sin(one.heading / 2), math.cos(one.heading / 2)) for one in boxes
+                (0.0, 0.0, math.sin(box.heading / 2), math.cos(box.heading / 2)) for box in boxes
             ],
             colors=[_STONE],
             fill_mode=FillMode.Solid,

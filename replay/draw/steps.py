@@ -123,7 +123,7 @@ def log_cycles(
     Returns:
         Each quantity with where it was written.
     """
-    found: list[tuple[Quantity, tuple[Series, ...]]] = []
+    quantities: list[tuple[Quantity, tuple[Series, ...]]] = []
     for quantity in dict.fromkeys(table.quantity for table in tables):
         own = [_steps(table, clock.start_ns) for table in tables if table.quantity == quantity]
         parts = tables_of(list(chain.from_iterable(own)))
@@ -134,8 +134,8 @@ def log_cycles(
             rec.flush()  # else what comes first in the file is chance
             log_rows(rec, clock, entity, part.t_ns, part.values)
             series.append(Series(entity, part.names))
-        found.append((quantity, tuple(series)))
-    return tuple(found)
+        quantities.append((quantity, tuple(series)))
+    return tuple(quantities)
 
 
 def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray]:

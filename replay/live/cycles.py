@@ -105,7 +105,7 @@ class CycleMeter:
                     stores.setdefault(track.name, []).append(track)
                     self._newest_ns = max(self._newest_ns, int(track.t_ns[-1]))
         self._add_gait(batch.columns.get((GAIT, "position"), ()))
-        found: list[Cycle] = []
+        cycles: list[Cycle] = []
         if self._gait_ns.size > 2 and any(name.endswith(".phase") for name in self._gait):
             gait = LoggedGait(self._seconds(self._gait_ns), self._gait)
             first = 0
@@ -115,10 +115,10 @@ class CycleMeter:
                 values = {name: value[first:stop] for name, value in gait.values.items()}
                 run = LoggedGait(gait.t_s[first:stop], values)
                 over = stop < gait.t_s.size
-                found += self._finished(run, planes_of(robot), over=over)
+                cycles += self._finished(run, planes_of(robot), over=over)
             self._cut_gait(first)
         self._forget()
-        return found
+        return cycles
 
     # -- the gait --------------------------------------------------------------------------
 
@@ -335,7 +335,7 @@ class CycleBars:
             self._write_bars(rec, quantity, tracks, palette)
             rec.reset_time()
             before = self._plots.get(quantity)
-            known = [] if before is None else [one.names for one in before.series]
+            known = [] if before is None else [series.names for series in before.series]
             plot = Plot(f"{CYCLES}/{quantity.key}", refined(known, [cycle.names]))
             plot.style(rec, palette, steps=True)
             plot.write(rec, clock, tracks)

@@ -118,8 +118,8 @@ class LiveLog:
     @property
     def units(self) -> dict[str, str]:
         """Topic to its unit; ``rad`` where its channel has none."""
-        channels = [one.channel for one in self._topics.values()]
-        return {one.topic: one.metadata.get("unit", "rad") for one in channels}
+        channels = [topic.channel for topic in self._topics.values()]
+        return {channel.topic: channel.metadata.get("unit", "rad") for channel in channels}
 
     def define(self, record: Description | object) -> None:
         """Take what explains messages; the same again changes nothing.
@@ -156,15 +156,15 @@ class LiveLog:
         for message in messages:
             by_channel.setdefault(message.channel_id, []).append(message)
             batch.messages += 1
-        found: list[tuple[_Topic, list[LiveMessage]]] = []
+        topics: list[tuple[_Topic, list[LiveMessage]]] = []
         for channel_id, own in by_channel.items():
             topic = self._topics.get(channel_id)
             if topic is None:
                 self.unread += len(own)
             else:
-                found.append((topic, own))
-        found.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these shift the times
-        for topic, own in found:
+                topics.append((topic, own))
+        topics.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these shift the times
+        for topic, own in topics:
             self._read(topic, own, batch)
         return batch
 
@@ -242,7 +242,7 @@ class LiveLog:
     ) -> tuple[Track, ...]:
         names, times, values = merge_rows(rows, topic, one, _ignore)
         offsets = self._offsets.get(OFFSET_TOPICS.get(topic, ""), {})
-        found: dict[str, Track] = {}
+        tracks: dict[str, Track] = {}
         for name, t_ns, column in zip(names, times, values, strict=True):
             if name in offsets:
                 key = name, t_ns.size
@@ -251,10 +251,10 @@ class LiveLog:
                 t_ns = own[key]  # noqa: PLW2901
             track = without_filler(Track(name, *ordered(t_ns, column)))
             if np.isfinite(track.values).any():
-                found[name] = track
+                tracks[name] = track
         chain = self.robot.joint_names if self.robot is not None else ()
-        inside = [found[name] for name in chain if name in found]
-        return (*inside, *(track for name, track in found.items() if name not in chain))
+        inside = [tracks[name] for name in chain if name in tracks]
+        return (*inside, *(track for name, track in tracks.items() if name not in chain))
 
     def _keep_offsets(self, topic: str, rows: Sequence[JointRows]) -> None:
         """Keep the last sample times relative to the stamp; none where all are zero."""
@@ -277,7 +277,7 @@ class LiveLog:
 
     def _groups(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[_Group]:
         """The messages by layout."""
-        found: list[_Group] = []
+        groups: list[_Group] = []
         by_length: dict[int, list[LiveMessage]] = {}
         for message in messages:
             by_length.setdefault(len(message.payload), []).append(message)
@@ -291,17 +291,17 @@ class LiveLog:
                 else:
                     own, own_log_ns = matrix[rows], log_ns[rows]
                     t_ns = self._on_log_clock(stamps_of(layout, own), own_log_ns)
-                    found.append(_Group(layout, t_ns, own_log_ns, own))
+                    groups.append(_Group(layout, t_ns, own_log_ns, own))
         if topic.sorter.is_full:
             topic.sorter = _sorter(topic.kind)
-        return found
+        return groups
 
     def _general(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[tuple[int, Any]]:
         """Log times and messages of any shape."""
         found: list[tuple[int, Any]] = []
         try:
             decode = topic.decode = topic.decode or decoder_of(topic.schema, topic.channel.topic)
-            found.extend((one.log_time_ns, decode(one.payload)) for one in messages)
+            found.extend((message.log_time_ns, decode(message.payload)) for message in messages)
         except DataError:
             self.unread += len(messages) - len(found)
         return found

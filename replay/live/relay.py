@@ -233,7 +233,7 @@ class LiveStream(BoundedStream):
         super().log(entity_path, entity, *extra, static=static, strict=strict)
 
     def _is_news(self, entity_path: str, archetypes: Sequence[Any]) -> bool:
-        batches = [batch for one in archetypes for batch in one.as_component_batches()]
+        batches = [batch for archetype in archetypes for batch in archetype.as_component_batches()]
         values = {
             (entity_path, str(batch.component_descriptor())): batch.as_arrow_array()
             for batch in batches

@@ -83,7 +83,7 @@ class _Window:
             kept = None if self.head is None else (self.head.t_ns, self.head.pose)
             path = _grown(kept, batch.head.t_ns, batch.head.pose)
             self.head = HeadPath.of(*path, tracked=True)
-        ends = [one.t_ns[-1] for tracks in batch.columns.values() for one in tracks]
+        ends = [track.t_ns[-1] for tracks in batch.columns.values() for track in tracks]
         self._newest_ns = max([self._newest_ns, *map(int, ends)])
 
     def ready_ns(self, tracks: Iterable[Track], *others: IntArray) -> int:
@@ -97,7 +97,7 @@ class _Window:
             The earliest of the inputs' last times, but no more than the patience before the newest
             sample of all [ns].
         """
-        ends = [int(t_ns[-1]) for t_ns in (*(one.t_ns for one in tracks), *others) if t_ns.size]
+        ends = [int(t_ns[-1]) for t_ns in (*(track.t_ns for track in tracks), *others) if t_ns.size]
         return max(min(ends, default=0), self._newest_ns - PATIENCE_NS)
 
 
@@ -230,8 +230,8 @@ class LiveScene:
 
     def _draw_lines(self, tracks: Mapping[str, Sequence[Track]], columns: Columns) -> None:
         """Write what is new of all lines; those that part once stay apart."""
-        for entity, own in tracks.items():
-            now = [tuple(one.name for one in part) for part in sampled_together(own)]
+        for entity, track in tracks.items():
+            now = [tuple(one.name for one in part) for part in sampled_together(track)]
             self._parts[entity] = refined(self._parts.get(entity, ()), now)
         plotted = dict(self._parts), self._places, self._palette
         if plotted != self._plotted:
@@ -301,7 +301,9 @@ class LiveScene:
         sparse = np.flatnonzero(is_sparse[rows])
         sensors = stage.range_sensors(robot, self._window.ranges)
         at_ns = motion.t_ns[sparse]
-        reading = np.array([hold(*self._window.ranges[one.topic], at_ns) for one in sensors]).T
+        reading = np.array(
+            [hold(*self._window.ranges[sensor.topic], at_ns) for sensor in sensors]
+        ).T
         look = Look(robot, self._places, self._palette, self._limit_w)
         stage.log_motion(
             self._rec, self._clock, motion, sparse, look=look, ranges=(sensors, reading)

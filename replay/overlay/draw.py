@@ -121,14 +121,14 @@ def log_placement(rec: rr.RecordingStream, entity: str, placed: Placement) -> No
     rec.log(f"{entity}/world", moved, static=True)
 
 
-def log_name(rec: rr.RecordingStream, one: Side, place: int, head: HeadPath, robot: Robot) -> None:
+def log_name(rec: rr.RecordingStream, side: Side, place: int, head: HeadPath, robot: Robot) -> None:
     """Write the session's name over its head.
 
     Args:
         place: Which session it is, 0 for the first: names of bodies at one place lie in tiers.
         head: The head's path.
     """
-    entity = f"{one.entity}{NAME}"
+    entity = f"{side.entity}{NAME}"
     look = rr.Points3D.from_fields(
         colors=tint(place), radii=rr.Radius.ui_points(0.5), show_labels=True
     )
@@ -138,10 +138,10 @@ def log_name(rec: rr.RecordingStream, one: Side, place: int, head: HeadPath, rob
     chosen = decimate(head.t_ns, _NAME_RATE_HZ)
     point = (head.position[chosen] + [0.0, 0.0, lift]).astype(np.float32)
     known = np.isfinite(point).sum(axis=1) == point.shape[1]  # no name where there is no body
-    for rows, times in one.clock.rows(head.t_ns[chosen]):
+    for rows, times in side.clock.rows(head.t_ns[chosen]):
         there = known[rows].astype(np.int64)
         text = rr.Points3D.columns(
-            positions=point[rows][there > 0], labels=[one.name] * int(there.sum())
+            positions=point[rows][there > 0], labels=[side.name] * int(there.sum())
         )
         rec.send_columns(entity, times, text.partition(there))
 
@@ -149,7 +149,7 @@ def log_name(rec: rr.RecordingStream, one: Side, place: int, head: HeadPath, rob
 def log_ends(rec: rr.RecordingStream, sessions: Sequence[Side]) -> None:
     """Remove each body when its session ends before the others."""
     for timeline in (SESSION_TIME, GAIT_CYCLE):
-        ends = {one.entity: _end(one, timeline) for one in sessions}
+        ends = {session.entity: _end(session, timeline) for session in sessions}
         known = {entity: end for entity, end in ends.items() if end is not None}
         for entity, end in known.items():
             if end < max(known.values()):
@@ -159,11 +159,11 @@ def log_ends(rec: rr.RecordingStream, sessions: Sequence[Side]) -> None:
                 rec.send_columns(f"{entity}{_SNAKE}", times, cleared)
 
 
-def _end(one: Side, timeline: str) -> int | None:
+def _end(side: Side, timeline: str) -> int | None:
     """Return a session's end on a timeline [ns], or None if it isn't on it."""
     if timeline == SESSION_TIME:
-        return one.end_ns - one.zero_ns
-    rhythm = one.clock.rhythm
+        return side.end_ns - side.zero_ns
+    rhythm = side.clock.rhythm
     return None if rhythm is None else round(float(rhythm.cycles.max()) * 1e9)
 
 
@@ -178,7 +178,7 @@ def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
     return np.where(is_drawn[:, None], values, np.nan)
 
 
-def places_in(other: Side, first: Places | None, own: Places | None) -> Places | None:
+def places_in(other: Side, first: Places | None, places: Places | None) -> Places | None:
     """Return the joints of another session that stand for its body.
 
     Args:
@@ -188,10 +188,10 @@ def places_in(other: Side, first: Places | None, own: Places | None) -> Places |
         The first session's where the other has them too, else its own.
     """
     known = {track.name for track in other.measured}
-    return first if first is not None and set(first.names) <= known else own
+    return first if first is not None and set(first.names) <= known else places
 
 
-def log_lines(rec: rr.RecordingStream, one: Side, rank: int, places: Places | None) -> bool:
+def log_lines(rec: rr.RecordingStream, side: Side, rank: int, places: Places | None) -> bool:
     """Write head, middle and tail of a session in degrees.
 
     Args:
@@ -202,17 +202,17 @@ def log_lines(rec: rr.RecordingStream, one: Side, rank: int, places: Places | No
         Whether any of them was measured.
     """
     labels = {} if places is None else places.labelled
-    tracks = {track.name: track for track in one.measured if track.name in labels}
+    tracks = {track.name: track for track in side.measured if track.name in labels}
     for name, label in labels.items():
         if (track := tracks.get(name)) is None:
             continue
-        entity = f"{LINES}{one.entity}/{rr.escape_entity_path_part(label)}"
-        title = f"{one.name}: {line_title(name, label)}"
-        log_look(rec, entity, [name], one.palette, titles={name: title}, width=_WIDTH)
+        entity = f"{LINES}{side.entity}/{rr.escape_entity_path_part(label)}"
+        title = f"{side.name}: {line_title(name, label)}"
+        log_look(rec, entity, [name], side.palette, titles={name: title}, width=_WIDTH)
         t_ns, values = mark_gaps(track.t_ns, track.values[:, None])
         if rank:
             values = _dashed(values, track.t_ns, rank)
-        log_rows(rec, one.clock, entity, t_ns, values, degrees=True)
+        log_rows(rec, side.clock, entity, t_ns, values, degrees=True)
     return bool(tracks)
 
 

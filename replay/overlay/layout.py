@@ -170,7 +170,7 @@ def build_blueprint(
     differing = [
         rrb.Horizontal(*_bar_differences(one), name=one.side.name) for one in shown[1:] if one.bars
     ]
-    charts = [bar_chart(one.title, f"{BARS}/{one.key}/**") for one in bars]
+    charts = [bar_chart(bar.title, f"{BARS}/{bar.key}/**") for bar in bars]
     groups = (
         (_both(shown), 1.25),
         (_differences(shown), 1.0),
@@ -201,14 +201,14 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
     looks = cast("dict[str, Any]", scene.properties)
     looks["EyeControls3D"].tracking_entity = f"{first.side.entity}{MEASURED}"
     overrides: dict[EntityPathLike, Any] = {
-        f"{one.side.entity}{TRAIL}": trail_window() for one in bodies
+        f"{body.side.entity}{TRAIL}": trail_window() for body in bodies
     }
-    for path in (f"{one.side.entity}{path}" for one in bodies[1:] for path in _HIDDEN):
+    for path in (f"{body.side.entity}{path}" for body in bodies[1:] for path in _HIDDEN):
         overrides[path] = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         name=title,
         origin="/",
-        contents=[f"{one.side.entity}/world/**" for one in bodies],
+        contents=[f"{body.side.entity}/world/**" for body in bodies],
         background=looks["Background"],
         line_grid=looks["LineGrid3D"],
         eye_controls=looks["EyeControls3D"],
@@ -217,26 +217,26 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
 
 
 def _both(shown: Sequence[Shown]) -> list[rrb.View]:
-    found: list[rrb.View] = []
+    views: list[rrb.View] = []
     if any(one.lines for one in shown):
-        found.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
+        views.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
     if powers := [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]:
-        found.append(plot("Mechanical power [W]", powers))
-    return found
+        views.append(plot("Mechanical power [W]", powers))
+    return views
 
 
 def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
     """Return a view for each plane and session, and one of the distance of the heads."""
     first, *others = shown
-    found: list[rrb.View] = []
-    for one in others:
-        for view in build_views(Content(first.side.robot, measured=one.differences)).angles:
+    views: list[rrb.View] = []
+    for other in others:
+        for view in build_views(Content(first.side.robot, measured=other.differences)).angles:
             plane = str(view.name).lower().replace("measured", "").strip()
-            view.name = f"{one.side.name} − {first.side.name}, {plane}".replace(", [", " [")
-            found.append(view)
+            view.name = f"{other.side.name} − {first.side.name}, {plane}".replace(", [", " [")
+            views.append(view)
     if apart := [f"{one.side.own}{SEPARATE}" for one in others if one.apart]:
-        found.append(plot("Heads apart [m]", apart))
-    return found
+        views.append(plot("Heads apart [m]", apart))
+    return views
 
 
 def _bar_differences(one: Shown) -> list[rrb.View]:
@@ -247,11 +247,11 @@ def _bar_differences(one: Shown) -> list[rrb.View]:
 
 
 def _words(shown: Sequence[Shown]) -> list[rrb.View]:
-    found: list[rrb.View] = [rrb.TextDocumentView(name="Side by side", contents=[FACTS])]
-    found += [
+    views: list[rrb.View] = [rrb.TextDocumentView(name="Side by side", contents=[FACTS])]
+    views += [
         rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
         for one in shown
     ]
     if events := [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]:
-        found.append(rrb.TextLogView(name="Events", contents=events))
-    return found
+        views.append(rrb.TextLogView(name="Events", contents=events))
+    return views

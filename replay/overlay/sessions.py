@@ -389,14 +389,14 @@ def head_distance(a: Side, b: Side, how: Align, placed: Placement, t_ns: IntArra
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
 
 
-def _heading(one: Side, t_ns: int) -> float | None:
+def _heading(side: Side, t_ns: int) -> float | None:
     """Return a body's heading in the cycle after a time [rad]; None if it isn't known."""
-    times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
+    times, rhythm = np.array([t_ns], dtype=np.int64), side.clock.rhythm
     if rhythm is not None:
         ends, known = times_of(rhythm, interpolate(rhythm.t_ns, rhythm.cycles, times) + 1.0)
         if known[0]:
             times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
-    forward = _directions(one, times)
+    forward = _directions(side, times)
     forward = forward[np.isfinite(forward).all(axis=1)]
     if not forward.size:
         return None

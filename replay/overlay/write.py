@@ -184,9 +184,13 @@ def write_overlay(
     Raises:
         LogWriteError: If the file can't be written, or a stop is requested.
     """
-    sides = [one.side for one in sessions]
-    warnings = [f"{one.side.name}: {text}" for one in sessions for text in one.recording.warnings]
-    found = {one.side.name: _compare(sessions[0], one) for one in sessions[1:]}
+    sides = [session.side for session in sessions]
+    warnings = [
+        f"{session.side.name}: {text}"
+        for session in sessions
+        for text in session.recording.warnings
+    ]
+    found = {session.side.name: _compare(sessions[0], session) for session in sessions[1:]}
     for name, one in found.items():
         warnings += [f"{name} (B): {text}" if len(found) > 1 else text for text in one.notes]
     placements = _placements(sessions, how, place, warnings)
@@ -194,10 +198,10 @@ def write_overlay(
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
     with recording_file(path, identity, ", ".join(names), sides[0].start_ns, stop) as rec:
         check_stop(path, stop)
-        send(rec, [_chunks(one) for one in sessions])
+        send(rec, [_chunks(session) for session in sessions])
         check_stop(path, stop)
         shown = _log(rec, sessions, found, placements, how)
-        seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
+        seen = [(session.side, session.seen) for session in sessions if session.seen is not None]
         quantities = draw.log_bars(rec, seen)
         title = _title(shown)
         text = words.markdown(
@@ -236,17 +240,17 @@ def _placements(
     sessions: Sequence[Converted], how: Align, place: Place, warnings: list[str]
 ) -> dict[str, Placement]:
     """Return the placements of the other bodies onto the first one; append a warning for each."""
-    bodies = [one.side for one in sessions if one.recording.content.start is not None]
-    found: dict[str, Placement] = {}
-    for one in bodies[1:] if place is Place.START else ():
-        placed, first = placement(bodies[0], one, how), bodies[0].name
-        text = f"{one.name} and {first} have no body at a shared moment: each in its own world"
+    bodies = [session.side for session in sessions if session.recording.content.start is not None]
+    placements: dict[str, Placement] = {}
+    for body in bodies[1:] if place is Place.START else ():
+        placed, first = placement(bodies[0], body, how), bodies[0].name
+        text = f"{body.name} and {first} have no body at a shared moment: each in its own world"
         if placed is not None:
-            found[one.name], text = placed, placement_text(placed, one.name, first)
+            placements[body.name], text = placed, placement_text(placed, body.name, first)
         warnings.append(text)
     if len(bodies) > 1 and place is Place.WORLD:
         warnings.append("every body is drawn at the pose of its own session")
-    return found
+    return placements
 
 
 def _log(
@@ -260,8 +264,8 @@ def _log(
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     a, content = sessions[0].side, sessions[0].recording.content
     shown = [Shown(a, content, draw.log_lines(rec, a, 0, content.places))]
-    for rank, one in enumerate(sessions[1:], start=1):
-        b, own = one.side, one.recording.content
+    for rank, session in enumerate(sessions[1:], start=1):
+        b, own = session.side, session.recording.content
         placed = placements.get(b.name, Placement())
         lines = draw.log_lines(rec, b, rank, draw.places_in(b, content.places, own.places))
         angles = draw.angle_differences(a, b, how)

@@ -277,12 +277,12 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         wanted={topic: fields for topic, fields in wanted.items() if fields},
         samples={
             entity: tuple(
-                one_after_another(own[name])
-                for name in sorted(own, key=lambda name: chain.get(name, math.inf))
+                one_after_another(line[name])
+                for name in sorted(line, key=lambda name: chain.get(name, math.inf))
             )
-            for entity, own in lines.items()
+            for entity, line in lines.items()
         },
-        parts={entity: _in_order(found, chain) for entity, found in parts.items()},
+        parts={entity: _in_order(part, chain) for entity, part in parts.items()},
         drawing_ns=np.concatenate([np.zeros(0, dtype=np.int64), *times]),
         power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
         context_ns=min(context_ns, _MOST_CONTEXT_NS),
@@ -319,13 +319,17 @@ def _carried(session: SessionView) -> dict[str, list[str]]:
 
     They are searched in the first second, and if one is missing in the whole session, once.
     """
-    wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != GAIT}
+    wanted = {
+        topic: wanted_field
+        for topic, wanted_field in wanted_fields(session).items()
+        if topic != GAIT
+    }
     stop_ns = session.start_ns + 1_000_000_000
     try:
         session.joint_columns(wanted, stop_ns=stop_ns)
     except (MissingChannelError, DataError):
         every = wanted.items()
-        return {k: [one for one in fields if comes(session, k, one)] for k, fields in every}
+        return {k: [field for field in fields if comes(session, k, field)] for k, fields in every}
     return wanted
 
 

@@ -141,9 +141,11 @@ class SweepPlan:
         """Yield keys that don't fit together, and what would be valid."""
         if (self.points is None) != (self.design is Design.GRID):
             yield "points", "a number for the designs random and sobol, none for grid"
-        if self.duration_s is not None and "duration_s" in {one.key for one in self.parameters}:
+        if self.duration_s is not None and "duration_s" in {
+            parameter.key for parameter in self.parameters
+        }:
             yield "duration_s", "left out, since it is a parameter"
-        ranges = [one.key for one in self.parameters if not one.values]
+        ranges = [parameter.key for parameter in self.parameters if not parameter.values]
         if self.design is Design.GRID and ranges:
             yield "design", f"random or sobol, since {ranges[0]} has a range instead of values"
 
@@ -176,11 +178,13 @@ def _check_size(top: Table, plan: SweepPlan) -> None:
     """Note a plan whose runs no computer would hold or end."""
     if len(plan.parameters) > _MOST_PARAMETERS:
         return  # noted before
-    runs = (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
+    runs = (
+        plan.points or math.prod(len(parameter.values) for parameter in plan.parameters)
+    ) * plan.seeds
     if runs > MOST_RUNS:
         top.fault("points", f"at most {MOST_RUNS} runs", f"{runs:.3g}")
         return
-    longest = sum(len(one.key) + one.longest for one in plan.parameters)
+    longest = sum(len(parameter.key) + parameter.longest for parameter in plan.parameters)
     if runs * longest > _MOST_CHARACTERS:
         valid = f"runs and parameters that take at most {_MOST_CHARACTERS} characters as text"
         top.fault("points", valid, f"{runs} runs of {longest} characters")
@@ -222,15 +226,15 @@ def _parameter(key: str, table: Table) -> Parameter:
         table.close()
         return Parameter(key, tuple(listed))
     low, high = table.number("low"), table.number("high")
-    one = Parameter(
+    parameter = Parameter(
         key, (), low, high, table.flag("log", default=False), table.flag("integer", default=False)
     )
     if low >= high:
         table.fault("high", f"above low = {low:g}")
-    if one.log and low <= 0.0:
+    if parameter.log and low <= 0.0:
         table.fault("low", "above 0, since log is true")
     table.close()
-    return one
+    return parameter
 
 
 def _is_value(value: object) -> bool:
@@ -253,9 +257,9 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
 
     The first points of a longer random or Sobol design are those of the shorter one.
     """
-    keys = [one.key for one in plan.parameters]
+    keys = [parameter.key for parameter in plan.parameters]
     if plan.design is Design.GRID:
-        every = itertools.product(*(one.values for one in plan.parameters))
+        every = itertools.product(*(parameter.values for parameter in plan.parameters))
         return [dict(zip(keys, values, strict=True)) for values in every]
     count = plan.points or 0
     if plan.design is Design.SOBOL:
@@ -266,7 +270,10 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     else:
         shares = np.random.default_rng(plan.design_seed).random((count, len(keys)))
     return [
-        {one.key: one.at(float(share)) for one, share in zip(plan.parameters, row, strict=True)}
+        {
+            parameter.key: parameter.at(float(share))
+            for parameter, share in zip(plan.parameters, row, strict=True)
+        }
         for row in shares
     ]
 

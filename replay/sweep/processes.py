@@ -147,10 +147,10 @@ def row_in(answer: bytes) -> Row:
     Raises:
         UndulogError: As :func:`.run.run_job`.
     """
-    found: Row | UndulogError = pickle.loads(answer)  # noqa: S301  of our own process
-    if isinstance(found, UndulogError):
-        raise found
-    return found
+    row: Row | UndulogError = pickle.loads(answer)  # noqa: S301  of our own process
+    if isinstance(row, UndulogError):
+        raise row
+    return row
 
 
 _OF_THIS_PROCESS = RunProcesses()

@@ -271,11 +271,11 @@ def result_columns(result: Analysis) -> Row:
         "answer": result.answer.verdict,
         "sentence": result.answer.sentence,
         "warnings": list(result.warnings),
-        "joint": [one.name for one in joints],
-        **{name: [getattr(one, name) for one in joints] for name in _OF_JOINTS},
+        "joint": [joint.name for joint in joints],
+        **{name: [getattr(joint, name) for joint in joints] for name in _OF_JOINTS},
     }
-    columns |= _columns("gain", [(one.gain.value, one.gain.ci95) for one in joints])
-    columns |= _columns("lag_rad", [(one.lag_rad.value, one.lag_rad.ci95) for one in joints])
+    columns |= _columns("gain", [(joint.gain.value, joint.gain.ci95) for joint in joints])
+    columns |= _columns("lag_rad", [(joint.lag_rad.value, joint.lag_rad.ci95) for joint in joints])
     single = {"frequency_hz": result.gait.frequency_hz, **result.heterogeneity}
     if result.energy is not None:
         transport = result.energy.transport

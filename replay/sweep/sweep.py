@@ -277,11 +277,16 @@ def _robots(plan: SweepPlan, scenario: str, folder: Path) -> dict[str, RobotText
     names: list[Any] = []
     with suppress(ValueError):
         names.append(read_toml(scenario).get("robot"))
-    names += [value for one in plan.parameters if one.key == "robot" for value in one.values]
-    found: dict[str, RobotText] = {}
+    names += [
+        value
+        for parameter in plan.parameters
+        if parameter.key == "robot"
+        for value in parameter.values
+    ]
+    texts: dict[str, RobotText] = {}
     for name in dict.fromkeys(map(str, names)):
         shipped = name in robot_names()
         if shipped or is_file(folder / name):
             robot = load_robot(name if shipped else folder / name)
-            found[name] = RobotText(robot.toml, dict(robot.databases))
-    return found
+            texts[name] = RobotText(robot.toml, dict(robot.databases))
+    return texts

@@ -156,15 +156,17 @@ def run_batch(
             quantised(one, scenario.sensing.servo.command_resolution)
             for scenario, one in zip(scenarios, commands, strict=True)
         ]
-    for scenario, one in zip(scenarios, commands, strict=True):
-        _check_shape(one, scenario)
+    for scenario, command in zip(scenarios, commands, strict=True):
+        _check_shape(command, scenario)
     groups: dict[_Shape, list[int]] = {}
     for i, (scenario, rows) in enumerate(zip(scenarios, commands, strict=True)):
         groups.setdefault((*_shape(scenario), len(rows)), []).append(i)
     runs: dict[int, BatchRun] = {}
     for group in groups.values():
-        one = scenarios[group[0]]
-        bytes_a_run = one.tick_count * len(one.robot.joints) * SAMPLE_ROWS * precision.itemsize
+        command = scenarios[group[0]]
+        bytes_a_run = (
+            command.tick_count * len(command.robot.joints) * SAMPLE_ROWS * precision.itemsize
+        )
         lanes = width or max(1, min(len(group), _BLOCK_BYTES // bytes_a_run))
         for first in range(0, len(group), lanes):
             members = group[first : first + lanes]
@@ -289,17 +291,17 @@ class _Block:
         self._samples = np.zeros((ticks, SAMPLE_ROWS, m, width), dtype)
         self._poses = np.zeros((ticks, HEAD_ROWS, width), dtype)
         self._failure = np.full((4, width), -1.0)
-        chains = {id(each.robot.links): _chain(each.robot) for each in lanes}
-        self._links[:, :SERVO] = _last([chains[id(each.robot.links)] for each in lanes])
-        servos = Servos([joint.servo for each in lanes for joint in each.robot.joints]).table
+        chains = {id(lane.robot.links): _chain(lane.robot) for lane in lanes}
+        self._links[:, :SERVO] = _last([chains[id(lane.robot.links)] for lane in lanes])
+        servos = Servos([joint.servo for lane in lanes for joint in lane.robot.joints]).table
         parameters = servos.reshape(len(servos), width, m).transpose(2, 0, 1)
         self._links[1:, SERVO : SERVO + len(servos)] = parameters
-        heading = np.array([each.world.heading for each in lanes]) / 2
-        self._head[PLACE + 2] = [resting_height(each) for each in lanes]
+        heading = np.array([lane.world.heading for lane in lanes]) / 2
+        self._head[PLACE + 2] = [resting_height(lane) for lane in lanes]
         self._head[TURN + 2], self._head[TURN + 3] = np.sin(heading), np.cos(heading)
-        self._head[VELOCITY : VELOCITY + 3] = _last([each.world.velocity for each in lanes])
-        self._ground[:] = _last([ground_table(each.world.ground) for each in lanes])
-        self._gravity[:] = _last([each.world.gravity for each in lanes])
+        self._head[VELOCITY : VELOCITY + 3] = _last([lane.world.velocity for lane in lanes])
+        self._ground[:] = _last([ground_table(lane.world.ground) for lane in lanes])
+        self._gravity[:] = _last([lane.world.gravity for lane in lanes])
         self._commands[:] = _last([*commands, *[commands[-1]] * (width - len(commands))])
         self._poses[0] = self._head
 

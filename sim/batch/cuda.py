@@ -111,12 +111,12 @@ def run_block_on_gpu(*block: Any) -> None:
     state = [cuda.to_device(array) for array in (links, head, failure)]
     filled = [cuda.device_array(array.shape, array.dtype) for array in (samples, poses)]
     filled[0][0].copy_to_device(samples[0])
-    known = [cuda.to_device(array) for array in (ground, gravity, vertical, commands, limits)]
+    devices = [cuda.to_device(array) for array in (ground, gravity, vertical, commands, limits)]
     with catch_warnings():
         # That few runs don't fill the GPU: their number is the caller's.
         filterwarnings("ignore", ".*Grid size")
         _kernel(links.dtype)[-(-lanes // _THREADS), _THREADS](
-            *(state[0], state[1], *known[:3], law, known[3], *filled, state[2], known[4]),
+            *(state[0], state[1], *devices[:3], law, devices[3], *filled, state[2], devices[4]),
             *times,
         )
     for array, copy in zip((links, head, failure), state, strict=True):

@@ -126,9 +126,9 @@ def null(
     driven = f"{len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} Hz"
     off = f"off the twin by at most {model.error:.2g} in ln gain and lag within its reach"
     lines = [f"{output}: {driven}; {off}"]
-    for one in model.parameters:
-        value = f"{one.name.replace('_', ' ')} {one.value:g} {one.unit}"
-        lines.append(f"{value}, by a factor exp(±{one.reach:g})")
+    for parameter in model.parameters:
+        value = f"{parameter.name.replace('_', ' ')} {parameter.value:g} {parameter.unit}"
+        lines.append(f"{value}, by a factor exp(±{parameter.reach:g})")
     emit(facts, lines, as_json=json)
 
 
@@ -247,16 +247,18 @@ def _listed(scenarios: Sequence[Scenario], columns: int) -> list[str]:
     """Lines that list scenarios, by robot, the descriptions wrapped to the terminal."""
     name_width = max(len(one.name) for one in scenarios)
     by_robot: dict[str, list[Scenario]] = {}
-    for one in scenarios:
-        by_robot.setdefault(one.robot.name, []).append(one)
+    for scenario in scenarios:
+        by_robot.setdefault(scenario.robot.name, []).append(scenario)
     lines = [f"{len(scenarios)} scenarios of {len(by_robot)} robots"]
     for robot, chosen in sorted(by_robot.items(), key=lambda item: -len(item[1])):
         lines += ["", f"{robot}, {len(chosen[0].robot.joints)} joints:"]
-        for one in chosen:
-            start = f"  {one.name:{name_width}} {one.duration_s:5g} s  "
+        for scenario in chosen:
+            start = f"  {scenario.name:{name_width}} {scenario.duration_s:5g} s  "
             wide = max(columns, len(start) + 40)
             indent = " " * len(start)
-            lines += wrap(one.description, wide, initial_indent=start, subsequent_indent=indent)
+            lines += wrap(
+                scenario.description, wide, initial_indent=start, subsequent_indent=indent
+            )
     return lines
 
 
@@ -361,8 +363,8 @@ def show(scenario: str, /, *, json: bool = False) -> None:
         "values": values,
     }
     rows = [
-        [(text, "") for text in (key, dumps(one["value"]), one["unit"] or "")]
-        for key, one in values.items()
+        [(text, "") for text in (key, dumps(value["value"]), value["unit"] or "")]
+        for key, value in values.items()
     ]
     texts, _ = table(_COLUMNS, rows, UNLIMITED)
     lines = [

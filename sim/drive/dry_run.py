@@ -128,7 +128,7 @@ class DryRun:
     def closest(self) -> tuple[str, Demand] | None:
         """The joint and the quantity that come closest to a limit, or go farthest beyond it."""
         demands = ((joint.name, demand) for joint in self.joints for demand in joint.demands)
-        finite = (one for one in demands if math.isfinite(one[1].share))
+        finite = (demand for demand in demands if math.isfinite(demand[1].share))
         return max(finite, key=lambda one: one[1].share, default=None)
 
     @property
@@ -433,7 +433,7 @@ def reported(run: DryRun) -> dict[str, Any]:
         "power_net_w": net / seconds,
         "power_el_w": electrical / seconds,
         "cut": list(run.cut),
-        "remarks": [{"level": one.level, "text": one.text} for one in run.remarks],
+        "remarks": [{"level": remark.level, "text": remark.text} for remark in run.remarks],
         "joints": [_joint(joint) for joint in run.joints],
         "path": None if run.path is None else str(run.path),
     }

@@ -129,14 +129,14 @@ class GateLimits:
     def facts(self) -> dict[str, str]:
         """For a session's metadata: each limit, as one number where all joints have the same."""
         found: dict[str, str] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 numbers: list[float] = value.tolist()
                 same = len({repr(number) for number in numbers}) == 1
-                found[each.name] = repr(numbers[0]) if same else json.dumps(numbers)
-            elif each.name != "joint_names":
-                found[each.name] = str(value)
+                found[field.name] = repr(numbers[0]) if same else json.dumps(numbers)
+            elif field.name != "joint_names":
+                found[field.name] = str(value)
         return found
 
 

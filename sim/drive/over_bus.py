@@ -81,7 +81,11 @@ def check_drivable(driven: MotionSource, robot: Robot) -> None:
     if robot.bus is None:
         raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
     for asked in (Direction.TX, Quantity.COMMAND), (Direction.RX, Quantity.POSITION):
-        there = {one.target for one in robot.bus.signals if (one.direction, one.quantity) == asked}
+        there = {
+            signal.target
+            for signal in robot.bus.signals
+            if (signal.direction, signal.quantity) == asked
+        }
         lacking = [name for name in robot.joint_names if name not in there]
         if lacking:
             direction, quantity = asked

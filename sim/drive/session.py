@@ -270,8 +270,8 @@ class BusSession:
         level = "error" if outcome.how is DriveEnding.FAULT else "info"
         why = f": {outcome.why}" if outcome.why else ""
         self.log_event(level, f"{outcome.how}{why}; {outcome.ended}")
-        for each in remarks:
-            self.log_event(*each)
+        for remark in remarks:
+            self.log_event(*remark)
         reasons = [text for kind, text in remarks if kind == "warn"]
         if outcome.how is DriveEnding.FAULT:
             self.writer.set_verdict("bad", [outcome.why, *reasons])
@@ -308,7 +308,7 @@ class BusSession:
 def _mount_of(path: Path) -> Path:
     """Where the disk of a file is mounted."""
     place = path.resolve()
-    return next(one for one in (place, *place.parents) if one.is_mount())
+    return next(parent for parent in (place, *place.parents) if parent.is_mount())
 
 
 def stamped(tick: BusTick, t_ns: int) -> BusTick:

@@ -253,9 +253,11 @@ class _Round:
         self, which: IntArray, middle: FloatArray, half: FloatArray, reach: FloatArray
     ) -> tuple[IntArray, Closest]:
         """Closest points of those pairs that may be within a reach of each other."""
-        found = to_circles(middle, half, self._shapes.centre[:, which], self._shapes.radius[which])
-        pair = np.flatnonzero(found.distance < reach)
-        return pair, Closest(found.s[pair], found.distance[pair], found.normal[:, pair])
+        circles = to_circles(
+            middle, half, self._shapes.centre[:, which], self._shapes.radius[which]
+        )
+        pair = np.flatnonzero(circles.distance < reach)
+        return pair, Closest(circles.s[pair], circles.distance[pair], circles.normal[:, pair])
 
 
 class _Square:
@@ -290,8 +292,8 @@ class _Square:
         pair = np.flatnonzero(rectangle_gaps(middle, half, size).max(axis=0) < reach)
         if not len(pair):
             return pair, Closest(reach[:0], reach[:0], middle[:, :0])
-        found = to_rectangles(middle[:, pair], half[:, pair], size[:, pair])
-        return pair, found._replace(normal=out_of_axes(axis[:, pair], found.normal))
+        rectangles = to_rectangles(middle[:, pair], half[:, pair], size[:, pair])
+        return pair, rectangles._replace(normal=out_of_axes(axis[:, pair], rectangles.normal))
 
 
 def _chosen(shapes: Cylinders | Boxes, which: IntArray) -> Iterator[FloatArray]:

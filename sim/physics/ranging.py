@@ -182,7 +182,9 @@ class Ranging(Generic[_Model]):
         self._schedule = Schedule(period_s, len(sensors), dt)
         self._bundles = (self._mounts.rotation @ bundles).transpose(1, 0, 2)  # (3, k, r)
         self._dt = dt
-        self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
+        self._limits = np.array(
+            [(sensor.range_min, sensor.range_max) for sensor in sensors], np.float64
+        )
         self._random = np.random.default_rng([seed, self.stream])
 
     def observe(self, steps: Steps, start: int) -> list[RangeSample]:
@@ -295,7 +297,7 @@ class Sonar(Ranging[SonarModel]):
     sees_ground = False
 
     def _rays(self, sensors: Sequence[Sensor]) -> tuple[float, FloatArray]:
-        cones = [cone(self._model.rays, one.field_of_view or 0.0) for one in sensors]
+        cones = [cone(self._model.rays, sensor.field_of_view or 0.0) for sensor in sensors]
         return 1.0 / self._model.rate_hz, np.array(cones)
 
     def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:

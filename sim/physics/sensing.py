@@ -68,10 +68,12 @@ class Mounts:
             sensors: Some of the robot's.
         """
         numbers = {link.name: i for i, link in enumerate(robot.links)}
-        self.link: IntArray = frozen(np.array([numbers[one.link] for one in sensors], np.int64))
-        self.position = frozen(np.array([one.position for one in sensors]).reshape(-1, 3))
+        self.link: IntArray = frozen(
+            np.array([numbers[sensor.link] for sensor in sensors], np.int64)
+        )
+        self.position = frozen(np.array([sensor.position for sensor in sensors]).reshape(-1, 3))
         self.rotation = frozen(
-            np.array([rotation_from_rpy(one.rpy) for one in sensors]).reshape(-1, 3, 3)
+            np.array([rotation_from_rpy(sensor.rpy) for sensor in sensors]).reshape(-1, 3, 3)
         )
 
     def poses(

@@ -83,7 +83,7 @@ class Accelerometer:
             gravity: Acceleration of gravity in the world [m/s^2], length 3.
             dt: Physics step [s].
         """
-        self._names = [one.name for one in sensors]
+        self._names = [sensor.name for sensor in sensors]
         self._mounts = Mounts(sensors, robot)
         self._gravity = np.array(gravity)
         self._model = model
@@ -153,7 +153,9 @@ def measured(sensors: Sequence[Sensor]) -> FloatArray:
     Returns:
         1 for an axis that a sensor measures and NaN for another, shape (k, 3).
     """
-    return np.array([[1.0 if axis in one.axes else np.nan for axis in "xyz"] for one in sensors])
+    return np.array(
+        [[1.0 if axis in sensor.axes else np.nan for axis in "xyz"] for sensor in sensors]
+    )
 
 
 def earth_field(model: CompassModel) -> FloatArray:
@@ -182,7 +184,7 @@ class Compass:
         Args:
             dt: Physics step [s].
         """
-        self._names = [one.name for one in sensors]
+        self._names = [sensor.name for sensor in sensors]
         self._mounts = Mounts(sensors, robot)
         self._schedule = Schedule(1.0 / model.rate_hz, len(sensors), dt)
         self._model = model
@@ -369,7 +371,9 @@ class Senses:
         )
         self._kinds = _kinds(scenario) if scenario.sensing.enabled else []
         self._accelerometers = frozenset(
-            one.name for one in scenario.robot.sensors if one.kind is SensorKind.ACCELEROMETER
+            sensor.name
+            for sensor in scenario.robot.sensors
+            if sensor.kind is SensorKind.ACCELEROMETER
         )
         self.readings = Readings.nothing(scenario.robot)
         self._start = 0  # number of the next period's first step
@@ -420,5 +424,5 @@ def _kinds(scenario: Scenario) -> list[_Sensors]:
         ),
         SensorKind.COMPASS: lambda own: Compass(models.compass, own, robot, dt=dt, seed=seed),
     }
-    sensors = {kind: [one for one in robot.sensors if one.kind is kind] for kind in build}
-    return [build[kind](own) for kind, own in sensors.items() if own]
+    sensors = {kind: [sensor for sensor in robot.sensors if sensor.kind is kind] for kind in build}
+    return [build[kind](sensor) for kind, sensor in sensors.items() if sensor]

@@ -84,12 +84,17 @@ class Servos:
         """
         parameters = [
             (
-                *(one.supply_v, one.resistance_ohm, one.torque_constant, one.proportional_gain),
-                *(one.rotor_inertia, one.viscous_friction, one.coulomb_friction),
-                *(one.gear_stiffness, one.gear_damping, one.backlash),
-                *(one.static_friction, one.stribeck_speed),
+                *(
+                    servo.supply_v,
+                    servo.resistance_ohm,
+                    servo.torque_constant,
+                    servo.proportional_gain,
+                ),
+                *(servo.rotor_inertia, servo.viscous_friction, servo.coulomb_friction),
+                *(servo.gear_stiffness, servo.gear_damping, servo.backlash),
+                *(servo.static_friction, servo.stribeck_speed),
             )
-            for one in servos
+            for servo in servos
         ]
         self.table = frozen(np.array(parameters, dtype=np.float64).reshape(-1, 12).T.copy())
         self.supply, self.resistance, self.torque_constant, self.gain = self.table[:4]

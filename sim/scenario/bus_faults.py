@@ -117,13 +117,13 @@ def read_faults(top: Table, robot: Robot | None) -> tuple[BusFault, ...]:
     Returns:
         The faults, without those that are wrong.
     """
-    found: list[BusFault] = []
+    faults: list[BusFault] = []
     for table in top.tables("faults"):
         kind = table.choice("kind", FaultKind)
         if kind is not None:
-            found.append(_read(table, kind, robot))
+            faults.append(_read(table, kind, robot))
         table.close()
-    return tuple(found)
+    return tuple(faults)
 
 
 def _read(table: Table, kind: FaultKind, robot: Robot | None) -> BusFault:
@@ -164,10 +164,10 @@ def parse_faults(texts: Iterable[str], robot: Robot) -> tuple[BusFault, ...]:
 
 
 def _parsed(text: str, robot: Robot) -> BusFault:
-    found = _TEXT.fullmatch(text)
-    if found is None:
+    match = _TEXT.fullmatch(text)
+    if match is None:
         raise UsageError(f"{text!r} is no fault: expected {FORM}")
-    word, *rest = found["what"].split(":")
+    word, *rest = match["what"].split(":")
     if word not in list(FaultKind):
         raise UsageError(f"{text!r}: no fault {word!r}; valid: {listed(FaultKind, word)}")
     kind = FaultKind(word)
@@ -183,8 +183,8 @@ def _parsed(text: str, robot: Robot) -> BusFault:
             raise UsageError(f"{text!r}: {value:g} is not {what}, above 0 and up to {most:g}")
     if rest:
         raise UsageError(f"{text!r}: {':'.join(rest)} is too much for {kind}; expected {FORM}")
-    from_s = 0.0 if found["from"] is None else _time(text, found["from"])
-    for_s = math.inf if found["for"] is None else _time(text, found["for"])
+    from_s = 0.0 if match["from"] is None else _time(text, match["from"])
+    for_s = math.inf if match["for"] is None else _time(text, match["for"])
     return BusFault(kind, joint, value, from_s, for_s)
 
 

@@ -371,8 +371,8 @@ def _check(table: Table, kind: ControllerKind, robot: Robot, roles: Layout) -> N
         missing.append("a range sensor that looks sideways")
     if "tail" in _PARTS[kind] and not roles.tail:
         missing.append("a range sensor on its last link")
-    compasses = [one for one in robot.sensors if one.kind is SensorKind.COMPASS]
-    on_head = [one for one in compasses if one.link == robot.links[0].name]
+    compasses = [sensor for sensor in robot.sensors if sensor.kind is SensorKind.COMPASS]
+    on_head = [compass for compass in compasses if compass.link == robot.links[0].name]
     if kind is ControllerKind.TARGET_FOLLOWING and not on_head:
         missing.append("a compass on its first link")
     if not len(robot.joint_indices(Plane.HORIZONTAL)):

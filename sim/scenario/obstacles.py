@@ -296,18 +296,18 @@ def columns(obstacles: Sequence[Obstacle]) -> tuple[Cylinders, Boxes]:
     Returns:
         Cylinders, and boxes with the walls among them, each in the order given.
     """
-    round_ones = [one for one in obstacles if isinstance(one, Cylinder)]
+    round_ones = [obstacle for obstacle in obstacles if isinstance(obstacle, Cylinder)]
     boxes = [
-        one.box if isinstance(one, Wall) else one
-        for one in obstacles
-        if not isinstance(one, Cylinder)
+        obstacle.box if isinstance(obstacle, Wall) else obstacle
+        for obstacle in obstacles
+        if not isinstance(obstacle, Cylinder)
     ]
     heading = [box.heading for box in boxes]
     return (
         Cylinders(
-            _rows([one.position for one in round_ones]),
-            _row([one.radius for one in round_ones]),
-            _row([one.height for one in round_ones]),
+            _rows([round_one.position for round_one in round_ones]),
+            _row([round_one.radius for round_one in round_ones]),
+            _row([round_one.height for round_one in round_ones]),
         ),
         Boxes(
             _rows([box.position for box in boxes]),
@@ -408,14 +408,15 @@ class RandomField:
         random = np.random.default_rng([seed if self.seed is None else self.seed, STREAM])
         head, tail = np.array(body)
 
-        def free(one: Cylinder, others: Sequence[Obstacle]) -> bool:
-            at = np.array(one.position)
+        def free(cylinder: Cylinder, others: Sequence[Obstacle]) -> bool:
+            at = np.array(cylinder.position)
             return (
-                _distance([one], (head + tail) / 2, (head - tail) / 2) >= self.clear
-                and _distance(others, at, np.zeros(2)) >= one.radius + self.gap
+                _distance([cylinder], (head + tail) / 2, (head - tail) / 2) >= self.clear
+                and _distance(others, at, np.zeros(2)) >= cylinder.radius + self.gap
                 and (
                     target is None
-                    or np.hypot(*(at - target.position)) >= target.radius + one.radius + self.clear
+                    or np.hypot(*(at - target.position))
+                    >= target.radius + cylinder.radius + self.clear
                 )
             )
 

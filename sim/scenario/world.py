@@ -270,7 +270,7 @@ def read_world(table: Table, robot: Robot | None, seed: int) -> World:
         World,
         gravity=lambda: _gravity(table),
         ground=lambda: None if surface is _Surface.NONE else ground,
-        obstacles=lambda: tuple(one for one in obstacles if one is not None),
+        obstacles=lambda: tuple(obstacle for obstacle in obstacles if obstacle is not None),
         field=lambda: None,
     )
     if "field" in table:

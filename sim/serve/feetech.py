@@ -97,7 +97,9 @@ class ServoChain:
             return b""
         if instruction == SYNC_READ and len(parameters) > 2:
             return b"".join(
-                self._read(one, *parameters[:2]) for one in parameters[2:] if one in own
+                self._read(parameter, *parameters[:2])
+                for parameter in parameters[2:]
+                if parameter in own
             )
         if instruction == ACTION:
             for one in own if servo == BROADCAST else (servo,):
@@ -193,8 +195,8 @@ class ServoPorts:
         for master in self._masters:
             os.close(master)
         if self._masters:
-            for one in self.paths:
-                one.unlink(missing_ok=True)
+            for path in self.paths:
+                path.unlink(missing_ok=True)
         self._masters = []
 
 

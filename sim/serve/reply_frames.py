@@ -150,7 +150,7 @@ class ReplyEncoder:
         for keys, field in zip(self._keys, fields, strict=True):
             values.update(zip(keys, _numbers(field), strict=True))
         frames = self._encoder.encode(values)
-        joint = [self._last_joint[each] for each in frames["id_flags"].tolist()]
+        joint = [self._last_joint[frame] for frame in frames["id_flags"].tolist()]
         start_ns = clock_ns(sample.cycle * _PERIOD_NS)
         frames["t_device_ns"] = start_ns + np.rint(sample.offset_s[joint] * NS).astype(np.int64)
         return frames

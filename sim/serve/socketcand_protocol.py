@@ -65,10 +65,10 @@ def sent_frame(kind: str, rest: str) -> bytes | None:
         The frame as :data:`.capture.sources.contract.pack_record` packs it, without times; None if
         it is malformed.
     """
-    found = _SENT.fullmatch(rest)
-    if found is None:
+    match = _SENT.fullmatch(rest)
+    if match is None:
         return None
-    digits, length, field = found.groups()
+    digits, length, field = match.groups()
     identifier = int(digits, 16)
     extended = len(digits) == _DIGITS_EXTENDED
     if identifier > (_HIGHEST_EXTENDED if extended else _HIGHEST_STANDARD):

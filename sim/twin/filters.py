@@ -180,21 +180,21 @@ class LowPass(Generic[_Value]):
         self._time_constant_s = time_constant_s
         self._value: _Value = start
 
-    def step(self, elapsed_s: float, wanted: _Value) -> _Value:
+    def step(self, elapsed_s: float, value: _Value) -> _Value:
         """Follow an input for a while.
 
         Args:
             elapsed_s: For how long [s].
-            wanted: x, held meanwhile.
+            value: x, held meanwhile.
 
         Returns:
             y at the end.
         """
         if self._time_constant_s > 0.0:
             left = math.exp(-elapsed_s / self._time_constant_s)
-            self._value = wanted + (self._value - wanted) * left
+            self._value = value + (self._value - value) * left
         else:
-            self._value = wanted
+            self._value = value
         return self._value
 
 

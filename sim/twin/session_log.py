@@ -200,7 +200,7 @@ class SessionLog:
             "/tf", parent="world", children=[link.name for link in robot.links]
         )
         sensors = robot.sensors if scenario.sensing.enabled else ()
-        self._sensors = {one.name: open_sensor(writer, one) for one in sensors}
+        self._sensors = {sensor.name: open_sensor(writer, sensor) for sensor in sensors}
         self._mode = writer.string("/gait/mode")
         self._events = writer.log("/rosout")
         self._lower, self._upper = robot.limits()

@@ -342,7 +342,7 @@ class _Grid:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.view(np.int8), [0]])))
         spans = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
         half = width // 2
-        found = [
+        repeats = [
             Repeats(
                 float(self.t_s[first if first == 0 else first + half]),
                 float(self.t_s[min(last - 1 + half + longest - 1, self.t_s.size - 1)]),
@@ -350,7 +350,7 @@ class _Grid:
             )
             for first, last in spans
         ]
-        return [window for window in found if window.cycles >= MIN_CYCLES]
+        return [window for window in repeats if window.cycles >= MIN_CYCLES]
 
     def _size(self, period: int, count: int) -> FloatArray:
         """Return the variance of each joint over the period from each sample on, shape (m, c)."""

@@ -111,9 +111,9 @@ def filled_arenas(
     """
     ids = set(channel_ids)
     wanted = [
-        each
-        for each in blocks
-        if (not ids.isdisjoint(each.index_at) if each.index_at else not each.is_empty)
+        block
+        for block in blocks
+        if (not ids.isdisjoint(block.index_at) if block.index_at else not block.is_empty)
     ]
     log_file.expect(wanted)
     runs = list(_runs(log_file, wanted))

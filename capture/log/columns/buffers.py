@@ -168,9 +168,9 @@ class EchoColumn:
         return np.empty(0, self._dtype) if self._own is None else self._own.column()
 
     def _copied(self, capacity: int) -> ColumnStore:
-        own = ColumnStore(self._dtype, 1, max(self._capacity, capacity))
-        own.append(self.column())
-        return own
+        store = ColumnStore(self._dtype, 1, max(self._capacity, capacity))
+        store.append(self.column())
+        return store
 
 
 @dataclass(frozen=True)

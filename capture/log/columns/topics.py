@@ -124,12 +124,12 @@ class Topics:
             for topic, paths in wanted.items()
         ]
         try:
-            found = read_messages(
+            messages = read_messages(
                 self._file, requests, window_ns=window_ns, warn=self._warn, threads=self._threads
             )
         except DataError as error:
             raise DataError(f"{self._file.path}: {error}") from None
-        return dict(zip(wanted, found, strict=True))
+        return dict(zip(wanted, messages, strict=True))
 
     @property
     def path(self) -> Path:

@@ -138,8 +138,8 @@ class Ros1Types:
         header = "builtin_interfaces/Time stamp\nstring frame_id\n"
         self._store.register(get_types_from_msg(header, _HEADER))
         known: dict[str, str] = {}
-        for one in connections:
-            known.setdefault(one.msgtype, one.msgdef.data)
+        for connection in connections:
+            known.setdefault(connection.msgtype, connection.msgdef.data)
         for kind, text in known.items():
             types = get_types_from_msg(text, kind)
             self._store.register({name: each for name, each in types.items() if name != _HEADER})

@@ -92,16 +92,16 @@ def read_stated(folder: Path) -> Stated:
     files = [folder / PurePath(name).name for name in listed]
     if len(set(files)) < len(files):
         raise NotALogError(path, "names a file twice; run 'ros2 bag reindex'")
-    for each in files:
-        if "\0" in each.name or not each.is_file():
+    for file in files:
+        if "\0" in file.name or not file.is_file():
             raise NotALogError(
-                path, f"names {each.name}, which is not there; run 'ros2 bag reindex'"
+                path, f"names {file.name}, which is not there; run 'ros2 bag reindex'"
             )
     mode, form = (_text(facts, f"compression_{name}") for name in ("mode", "format"))
     if mode not in ("", "file", "message", "storage") or (mode and form not in ("zstd", "")):
         raise NotALogError(path, f"states the compression {mode[:40]} by {form[:40]}, not zstd")
     topics = _list(facts, "topics_with_message_count")
-    names = (_field(_field(each, "topic_metadata"), "name") for each in topics)
+    names = (_field(_field(topic, "topic_metadata"), "name") for topic in topics)
     return Stated(
         files,
         mode,

@@ -58,11 +58,11 @@ class BoundedReader(Reader):
 
     def read_chunk_info(self) -> ChunkInfo:
         """Read the place of a chunk; raises ``ReaderError`` if another one has it."""
-        found = super().read_chunk_info()
-        if found.pos in self._places:
-            raise ReaderError(f"two chunks are at byte {found.pos}.")
-        self._places.add(found.pos)
-        return found
+        chunk_info = super().read_chunk_info()
+        if chunk_info.pos in self._places:
+            raise ReaderError(f"two chunks are at byte {chunk_info.pos}.")
+        self._places.add(chunk_info.pos)
+        return chunk_info
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
         """Read an index; raises ``ReaderError`` if all are longer than the file."""

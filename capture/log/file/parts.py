@@ -145,13 +145,13 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
         NotALogError: If the only file is no log.
         LogError: If the only file can't be opened.
     """
-    found = PartFiles()
+    files = PartFiles()
     try:
-        _open_parts(found, first, bare=bare)
+        _open_parts(files, first, bare=bare)
     except BaseException:
-        found.close()
+        files.close()
         raise
-    return found
+    return files
 
 
 def check_chain(parts: PartFiles) -> Iterator[str]:
@@ -168,30 +168,30 @@ def check_chain(parts: PartFiles) -> Iterator[str]:
             )
 
 
-def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
+def _open_parts(files: PartFiles, first: Path, *, bare: bool) -> None:
     paths = {1: first}
     local = not isinstance(first, RemotePath)
     if local and (stored_path(part_path(first, 2)).exists() or not stored_path(first).exists()):
         paths |= _later(first)
     opened: dict[int, McapFile] = {}
     try:
-        _open_all(opened, paths, found.missing, bare=bare)
+        _open_all(opened, paths, files.missing, bare=bare)
         if len(paths) == 1 and 1 in opened and "next" in _part_record(opened[1]):
             paths |= _later(first)
             rest = {number: path for number, path in paths.items() if number > 1}
-            _open_all(opened, rest, found.missing, bare=True)
+            _open_all(opened, rest, files.missing, bare=True)
     finally:
-        found.files |= sorted(opened.items())
-        found.paths += paths.values()
+        files.files |= sorted(opened.items())
+        files.paths += paths.values()
     for number, file in sorted(opened.items()):
         begun = bare and file.cut and not file.blocks  # died before the first message
         reason = "" if begun else _stranger(opened, number)
         if reason:
-            found.missing.append(f"{file.path.name} {reason}: left out")
+            files.missing.append(f"{file.path.name} {reason}: left out")
         if reason or (begun and number > 1):
-            del opened[number], found.files[number]
+            del opened[number], files.files[number]
             file.close()
-    found.missing += _gaps(found, first, {*paths} if 1 in opened else {*paths} - {1}, bare=bare)
+    files.missing += _gaps(files, first, {*paths} if 1 in opened else {*paths} - {1}, bare=bare)
 
 
 def _open_all(
@@ -273,12 +273,12 @@ def _stranger(opened: dict[int, McapFile], number: int) -> str:
     return ""
 
 
-def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list[str]:
+def _gaps(files: PartFiles, first: Path, there: set[int], *, bare: bool) -> list[str]:
     """Describe the parts that are missing."""
-    if not found.files:
+    if not files.files:
         return []
-    last = max(found.files)
-    end = _part_record(found.files[last])
+    last = max(files.files)
+    end = _part_record(files.files[last])
     gone = [number for number in range(1, last) if number not in there]
     texts = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
     if bare:  # the write-ahead log knows how much was recorded after the last file

@@ -291,7 +291,7 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
     late = _number(before.get(RECORDER, NO_VALUES), ELAPSED) > FIRST_S
     if late and first == last:
         return ()  # one message has no counts of the time of the file
-    found: list[SourceHealth] = []
+    healths: list[SourceHealth] = []
     for status in after:
         if not status.name.startswith(SOURCE_PREFIX) or "frames" not in status.values:
             continue
@@ -301,8 +301,8 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
             for key in _COUNTS
             if key in status.values
         }
-        found.append(SourceHealth(status.name.removeprefix(SOURCE_PREFIX), **counts))
-    return tuple(sorted(found, key=lambda source: source.name))
+        healths.append(SourceHealth(status.name.removeprefix(SOURCE_PREFIX), **counts))
+    return tuple(sorted(healths, key=lambda source: source.name))
 
 
 def judge_source(source: SourceHealth) -> Iterator[Finding]:

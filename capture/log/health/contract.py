@@ -149,12 +149,12 @@ def _container(log: OpenLog) -> Iterator[Violation]:
             yield Violation("profile", f"{name}: header", repr(file.profile), "write 'ros2'")
         if file.cut:
             yield Violation("summary", name, file.cut, "finish the file: summary, then footer")
-        chunks = [one for one in file.blocks if one.record_at and not one.is_empty]
-        other = sorted({one.compression or "none" for one in chunks} - {"zstd"})
-        if other or len(chunks) < len([one for one in file.blocks if not one.is_empty]):
+        chunks = [block for block in file.blocks if block.record_at and not block.is_empty]
+        other = sorted({chunk.compression or "none" for chunk in chunks} - {"zstd"})
+        if other or len(chunks) < len([block for block in file.blocks if not block.is_empty]):
             found = ", ".join(other) or "messages outside of chunks"
             yield Violation("compression", f"{name}: chunks", found, "compress them with zstd")
-        bare = sum(not one.crc for one in chunks)
+        bare = sum(not chunk.crc for chunk in chunks)
         if bare:
             found = f"{bare} of {len(chunks)} without a CRC"
             yield Violation("crc", f"{name}: chunks", found, "write uncompressed_crc")
@@ -164,11 +164,13 @@ def _container(log: OpenLog) -> Iterator[Violation]:
 
 def _shared_chunks(file: McapFile, name: str) -> Iterator[Violation]:
     alone = {
-        key: one.topic
-        for key, one in file.channels.items()
-        if one.topic == "/tf" or one.topic.startswith(_FRAME_PREFIXES) or _is_joint(file, key)
+        key: channel.topic
+        for key, channel in file.channels.items()
+        if channel.topic == "/tf"
+        or channel.topic.startswith(_FRAME_PREFIXES)
+        or _is_joint(file, key)
     }
-    topics = {key: one.topic for key, one in file.channels.items()}
+    topics = {key: channel.topic for key, channel in file.channels.items()}
     mixed: dict[str, set[str]] = {}
     for block in file.blocks:
         held = {topics[key] for key in block.index_at if key in topics}

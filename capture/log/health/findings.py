@@ -68,7 +68,7 @@ def joined(faults: Iterable[Fault]) -> list[Finding]:
     by_text: dict[tuple[int, str], list[Fault]] = {}
     for fault in faults:
         if fault.gaps:
-            found = (known for known in groups if _one_loss(known[0], fault))
+            found = (group for group in groups if _one_loss(group[0], fault))
             group = next(found, list[Fault]())
         else:
             group = by_text.setdefault((fault.weight, fault.text), [])
@@ -78,11 +78,15 @@ def joined(faults: Iterable[Fault]) -> list[Finding]:
     return [_finding(group) for group in groups]
 
 
-def _one_loss(one: Fault, other: Fault) -> bool:
+def _one_loss(fault: Fault, other: Fault) -> bool:
     """Whether the gaps of two channels are of one loss: equal in number, the longest overlap."""
-    if not one.gaps or (one.weight, one.gaps, one.late) != (other.weight, other.gaps, other.late):
+    if not fault.gaps or (fault.weight, fault.gaps, fault.late) != (
+        other.weight,
+        other.gaps,
+        other.late,
+    ):
         return False
-    (begin, end), (start, stop) = one.lost_ns, other.lost_ns
+    (begin, end), (start, stop) = fault.lost_ns, other.lost_ns
     return 2 * (min(end, stop) - max(begin, start)) > min(end - begin, stop - start)
 
 
@@ -101,8 +105,8 @@ def _where(group: Sequence[Fault]) -> str:
     for fault in group:
         names.setdefault(fault.topic, []).append(fault.name)
     topics: dict[tuple[str, ...], list[str]] = {}
-    for topic, found in names.items():
-        topics.setdefault(tuple(found), []).append(topic)
+    for topic, name in names.items():
+        topics.setdefault(tuple(name), []).append(topic)
     return "; ".join(
         listed(where) + ("" if found == ("",) else f", {listed(found)}")
         for found, where in topics.items()

@@ -298,7 +298,7 @@ def judge_following(fault: JointFault) -> Finding:
 
 def judge_differences(judgement: Judgement) -> Iterator[Finding]:
     """Yield findings on names, and on joints that changed, or that move besides their command."""
-    found = [clause_of(each, each.joint) for each in (*judgement.changes, *judgement.extra)]
+    found = [clause_of(change, change.joint) for change in (*judgement.changes, *judgement.extra)]
     yield from (Finding(1, clause) for clause in (judgement.naming, *found) if clause)
 
 

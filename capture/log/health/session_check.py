@@ -64,7 +64,7 @@ class Container:
 
 def check_container(file: McapFile) -> Container:
     """Check all records of an MCAP file whose magic is right."""
-    found = Container()
+    container = Container()
     with file.whole() as data:
         last, at, header_stop = 0, len(MAGIC), len(MAGIC)
         ended = False
@@ -75,24 +75,26 @@ def check_container(file: McapFile) -> Container:
             elif opcode == Opcode.CHUNK:
                 chunk = chunk_at(data, start, stop)
                 if chunk is None:
-                    found.damage.append(f"the chunk at byte {start - PREFIX_SIZE} has no header")
+                    container.damage.append(
+                        f"the chunk at byte {start - PREFIX_SIZE} has no header"
+                    )
                 else:
                     chunk.complete = True  # as its record is
-                    found.chunks[chunk.start] = chunk
+                    container.chunks[chunk.start] = chunk
             elif opcode == Opcode.DATA_END and ended:  # each CRC covers all of the data section
-                found.damage.append(f"the data section ends a second time at byte {start}")
+                container.damage.append(f"the data section ends a second time at byte {start}")
             elif stop - start >= 4:
                 ended = ended or opcode == Opcode.DATA_END
-                found.damage += _outside_chunks(data, opcode, start, stop, header_stop)
+                container.damage += _outside_chunks(data, opcode, start, stop, header_stop)
             if opcode == Opcode.FOOTER:
                 break
         if last != Opcode.FOOTER:
-            found.truncated = data[-len(MAGIC) :] != MAGIC
-            if not found.truncated:
-                found.damage.append(f"the chain of records breaks at byte {at}")
+            container.truncated = data[-len(MAGIC) :] != MAGIC
+            if not container.truncated:
+                container.damage.append(f"the chain of records breaks at byte {at}")
         elif data[at:] != MAGIC:
-            found.truncated = True
-    return found
+            container.truncated = True
+    return container
 
 
 def _outside_chunks(
@@ -232,7 +234,7 @@ class _Check:
             judge_following(fault)
             for fault in judgement.faults
             if fault.kinds != ("lost_samples",)
-            or not any(_names(one, fault.joint) for one in reasons)
+            or not any(_names(reason, fault.joint) for reason in reasons)
         ] + [*judge_differences(judgement)]
 
     # -- reading ---------------------------------------------------------------------------

@@ -197,7 +197,7 @@ class SessionScan:
         found.sort(key=lambda item: item[1].topic)
         every = [taken.get(key) or self.measure(key) for key, _ in found]
         channels = tuple(each.channel for each in every)
-        series = tuple(one for each in every for one in each.series)
+        series = tuple(series for each in every for series in each.series)
         joints = self._joints(found)
         bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
         buses = tuple(
@@ -213,14 +213,14 @@ class SessionScan:
         types = {channel.topic: channel.type_name for channel in channels}
         chain = self._robot.joint_names if self._robot is not None else ()
         seen = [joint.name for joint in joints if joint.topic == self._states]
-        unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
+        unseen = set(chain).difference(joint.name for joint in joints if joint.nan < joint.samples)
         why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
         topics = judge_topics(types, self._angles, chain, seen, why, commanded=self.commanded)
         findings = [*before, *topics]
         faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
-        first = [each.first_log_ns for each in series if each.topic == self._commands]
+        first = [series.first_log_ns for series in series if series.topic == self._commands]
         commands_ns = min(first, default=None)
         for each in series:
             if each.topic not in framed:
@@ -272,7 +272,7 @@ class SessionScan:
 
     def _joints(self, scans: list[tuple[int, ChannelScan]]) -> tuple[JointHealth, ...]:
         limited = set(self._robot.joint_names) if self._robot is not None else set[str]()
-        found: dict[tuple[str, str], JointHealth] = {}
+        healths: dict[tuple[str, str], JointHealth] = {}
         for key, scan in scans:
             for series in scan.series.values():
                 runs = self._frozen(key, series, scans) if scan.topic == self._states else {}
@@ -288,13 +288,13 @@ class SessionScan:
                         frozen_s=None if longest is None else longest[0],
                         frozen_at_ns=0 if longest is None else longest[1] * NS,
                     )
-                    had = found.get((scan.topic, name))
-                    found[scan.topic, name] = joint if had is None else had.with_more(joint)
+                    had = healths.get((scan.topic, name))
+                    healths[scan.topic, name] = joint if had is None else had.with_more(joint)
         closed = self._closed(scans)
         for _, scan in scans:
             for series in scan.series.values():
                 series.ranges.forget(closed)
-        return tuple(found.values())
+        return tuple(healths.values())
 
     def _frozen(
         self, key: int, series: Series, scans: list[tuple[int, ChannelScan]]

@@ -35,15 +35,19 @@ def with_skipped_cycles(
         sources: Counts of the recorder; empty if it has none, and then nothing is proved.
         commands: Topic of the commands.
     """
-    counted = any(each.topic == commands and each.sequence.dropped == 0 for each in channels)
+    counted = any(
+        channel.topic == commands and channel.sequence.dropped == 0 for channel in channels
+    )
     if not counted or not sources or not all(map(_is_whole, sources)):
         return tuple(series)
-    skipped = [each.timing for each in series if each.topic == commands and each.timing.gaps]
+    skipped = [
+        series.timing for series in series if series.topic == commands and series.timing.gaps
+    ]
     return tuple(
-        replace(each, timing=_all_late(each.timing))
-        if any(_same_cycles(each, timing, commands) for timing in skipped)
-        else each
-        for each in series
+        replace(series, timing=_all_late(series.timing))
+        if any(_same_cycles(series, timing, commands) for timing in skipped)
+        else series
+        for series in series
     )
 
 

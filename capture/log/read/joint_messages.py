@@ -146,7 +146,7 @@ def is_of_joints(kind: MessageType) -> bool:
         return False
     if kind.name == JOINT_STATE:
         arrays = [fields.get(name) for name in UNITS]
-        return all(one is not None and one.is_array and one.base for one in arrays)
+        return all(array is not None and array.is_array and array.base for array in arrays)
     if kind.name == DYNAMIC_STATE:
         parts = _parts(fields.get("interface_values"))
         bases = {name: part.base for name, part in parts.items()}
@@ -371,10 +371,10 @@ def points_in_force(
     found = [
         (
             names,
-            np.concatenate([t_ns for t_ns, _ in reversed(own)]),
-            np.concatenate([values for _, values in reversed(own)]),
+            np.concatenate([t_ns for t_ns, _ in reversed(part)]),
+            np.concatenate([values for _, values in reversed(part)]),
         )
-        for names, own in parts.items()
+        for names, part in parts.items()
     ]
     return found, replaced
 

@@ -125,12 +125,12 @@ class JointReader:
             DataError: If a topic is not of JointStates, or there is no such field.
         """
         requests = self.requests(wanted)
-        found: dict[str, Messages] | None = None
+        messages: dict[str, Messages] | None = None
         if self._topics.is_ours and window_ns != (None, None):
-            found = self._topics.read(requests, widened(window_ns, NEAR_NS))
-        if found is None or not covers(found, window_ns):
-            found = self._topics.read(requests, widened(window_ns, SLACK_NS))
-        return self.signals(wanted, found, window_ns)
+            messages = self._topics.read(requests, widened(window_ns, NEAR_NS))
+        if messages is None or not covers(messages, window_ns):
+            messages = self._topics.read(requests, widened(window_ns, SLACK_NS))
+        return self.signals(wanted, messages, window_ns)
 
     def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str] | None]:
         """Return the topics and leaf paths to read for some fields, with the offset topics.
@@ -160,7 +160,7 @@ class JointReader:
             own, known = leaf_paths(source, kind, fields), paths.get(source.topic, {})
             both = None if own is None or known is None else known | dict.fromkeys(own)
             paths[source.topic] = both
-        return {topic: None if own is None else list(own) for topic, own in paths.items()}
+        return {topic: None if path is None else list(path) for topic, path in paths.items()}
 
     def carried(self, name: str) -> dict[str, tuple[str, ...]]:
         """Return the fields that a topic ever has, each with its joints in order of appearance.
@@ -173,10 +173,10 @@ class JointReader:
         source, kind = self._source(name)
         found: dict[str, dict[str, None]] = {}
         if kind == TRAJECTORY:
-            for one in self._read_trajectories(source.topic):
-                for field, values in one.values.items():
+            for read_trajectory in self._read_trajectories(source.topic):
+                for field, values in read_trajectory.values.items():
                     if values.size:
-                        found.setdefault(field, {}).update(dict.fromkeys(one.names))
+                        found.setdefault(field, {}).update(dict.fromkeys(read_trajectory.names))
         else:
             for group in self._topics.read({source.topic: []}, (None, None))[source.topic].groups:
                 for field, names in carried(source, kind, group.layout).items():
@@ -211,13 +211,13 @@ class JointReader:
     def signals(
         self,
         wanted: Mapping[str, Sequence[str]],
-        found: Mapping[str, Messages],
+        messages: Mapping[str, Messages],
         window_ns: Window,
     ) -> dict[tuple[str, str], JointSignals]:
         """Return the signals of messages that were read.
 
         Args:
-            found: The messages of :meth:`requests`.
+            messages: The messages of :meth:`requests`.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
 
         Returns:
@@ -227,12 +227,12 @@ class JointReader:
             MissingChannelError: If a topic never carries a field.
         """
         keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
-        series = {key: self._series(*key, found, window_ns) for key in keys}
-        times = {key: list(each.t_ns) for key, each in series.items()}
+        series = {key: self._series(*key, messages, window_ns) for key in keys}
+        times = {key: list(series.t_ns) for key, series in series.items()}
         for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
             own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
             stamped = [series[key] for key in own]
-            offsets = self._offset_series(offset_topic, found, stamped, window_ns)
+            offsets = self._offset_series(offset_topic, messages, stamped, window_ns)
             if not any(values.any() for values in offsets.values):
                 continue  # sampled together
             if offset_topic in wanted:
@@ -254,14 +254,14 @@ class JointReader:
     def _offset_series(
         self,
         topic: str,
-        found: Mapping[str, Messages],
+        messages: Mapping[str, Messages],
         stamped: Sequence[Series],
         window_ns: Window,
     ) -> Series:
         """Return the offsets of a topic from before the first stamp on; may be overwritten."""
         if topic in self._offsets:
             return _copied(self._offsets[topic])
-        offsets = self._series(topic, "position", found, window_ns)
+        offsets = self._series(topic, "position", messages, window_ns)
         first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
         known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
         if known or window_ns[0] is None:
@@ -311,12 +311,12 @@ class JointReader:
         self,
         name: str,
         field: str,
-        found: Mapping[str, Messages],
+        messages: Mapping[str, Messages],
         window_ns: Window = (None, None),
     ) -> Series:
         """Return one field of a topic at message stamps on the log's clock."""
         source, kind = self._source(name)
-        rows = self._rows(name, field, found)
+        rows = self._rows(name, field, messages)
         if (rows or kind == TRAJECTORY) and not any(row.values.size for row in rows):
             raise MissingChannelError(
                 self._path, f"{field} in {name}", self._filled(source, kind, window_ns)
@@ -389,15 +389,15 @@ class JointReader:
         return signals if order == names else signals.select(order)
 
     def _general_rows(
-        self, source: JointSource, kind: str, field: str, found: Messages
+        self, source: JointSource, kind: str, field: str, messages: Messages
     ) -> list[JointRows]:
         """Read JointStates without a layout by the general decoder."""
-        if not found.unread:
+        if not messages.unread:
             return []
         rows: list[JointRows] = []
         lost = 0
         decode = self._topics.decoder(source.topic) if kind == JOINT_STATE else None
-        for item in found.unread:
+        for item in messages.unread:
             if decode is None:
                 lost += 1
                 continue
@@ -412,7 +412,7 @@ class JointReader:
             times = np.array([stamp_ns]), np.array([item.log_ns])
             rows.append(JointRows(distinct_names(message.name), *times, values))
         if lost:
-            self._warn(f"{source.topic}: {lost} messages can't be read: {found.unread[0].why}")
+            self._warn(f"{source.topic}: {lost} messages can't be read: {messages.unread[0].why}")
         return rows
 
     def _filled(self, source: JointSource, kind: str, window_ns: Window) -> list[str]:

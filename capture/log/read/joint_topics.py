@@ -211,7 +211,7 @@ def _robots(
     pairs: dict[str, tuple[_Candidate, _Candidate]] = {}
     for command in commands:
         space = command.topic.rpartition("/")[0]
-        of_it = (one for one in responses if one.topic.rpartition("/")[0] == space)
+        of_it = (response for response in responses if response.topic.rpartition("/")[0] == space)
         state = next((one for one in of_it if one.topic != command.topic), None)
         if state is not None and {*command.joints} & {*state.joints}:
             pairs.setdefault(space, (command, state))
@@ -222,7 +222,7 @@ def _robots(
 
 
 def _sorted(candidates: Iterable[_Candidate], without: str) -> list[_Candidate]:
-    kept = (one for one in candidates if one.name != without)
+    kept = (candidate for candidate in candidates if candidate.name != without)
     return sorted(kept, key=lambda one: (one.rank, -one.count, one.name))
 
 
@@ -292,15 +292,22 @@ class JointTopicFinder:
                 responses,
                 key=lambda one: (one.rank, one.topic != own, (command, one.name) not in robots),
             )
-            if best.rank < _UNNAMED or sum(one.rank == _UNNAMED for one in responses) == 1:
+            if (
+                best.rank < _UNNAMED
+                or sum(response.rank == _UNNAMED for response in responses) == 1
+            ):
                 response = taken["positions"] = best.name
         if set(every.get(response, ())).isdisjoint(self._names_of(command, every)):
             # Joints of another part of the robot: a controller has its own states beside them.
             source = joint_source(command, channels)
-            own = [one for one in responses if source is not None and one.topic == source.topic]
+            own = [
+                response
+                for response in responses
+                if source is not None and response.topic == source.topic
+            ]
             if own and response == RESPONSE_TOPIC:
                 response = taken["positions"] = own[0].name
-        others = [one.name for one in (*commands, *responses)]
+        others = [command.name for command in (*commands, *responses)]
         arrays = [topic for topic, kind, _ in self._joint_topics() if kind in FLOAT_ARRAYS]
         taken_topics = {one.topic for one in commands if one.name == command}
         others += [f"{topic}:JOINT,..." for topic in arrays if topic not in taken_topics]
@@ -360,7 +367,7 @@ class JointTopicFinder:
         if width and width == len(self._joints):
             return self._joints
         states = _sorted(self._responses(self._every), topic)
-        named = (one for one in states if len(one.joints) == width > 0)
+        named = (state for state in states if len(state.joints) == width > 0)
         first = next((one for one in named if not any("," in name for name in one.joints)), None)
         if first is None:
             return ()
@@ -447,7 +454,7 @@ class JointTopicFinder:
     def _filled(self, topic: str, parts: Sequence[str]) -> list[str]:
         """Return the parts of a controller state that have positions in its first message."""
         layout = self._first_layout(topic)
-        return [one for one in parts if layout and f"{one}.positions" in layout.leaves]
+        return [part for part in parts if layout and f"{part}.positions" in layout.leaves]
 
     def _width(self, topic: str) -> int:
         """Return the number of values in the first message of an array."""

@@ -173,22 +173,22 @@ class OpenLog:
         if sentence not in self.warnings:
             self.warnings.append(sentence)
 
-    def _groups(self, topic: str, found: Messages) -> list[Group]:
-        if found.unread:
-            why = found.unread[0].why
-            self._warn(f"{topic}: {len(found.unread)} messages can't be read: {why}")
-        return found.groups
+    def _groups(self, topic: str, messages: Messages) -> list[Group]:
+        if messages.unread:
+            why = messages.unread[0].why
+            self._warn(f"{topic}: {len(messages.unread)} messages can't be read: {why}")
+        return messages.groups
 
     def _as_tables(
-        self, wanted: Mapping[str, Sequence[str] | None], found: dict[str, Messages]
+        self, wanted: Mapping[str, Sequence[str] | None], messages: dict[str, Messages]
     ) -> dict[str, pd.DataFrame]:
-        """Return tables of some messages, which are removed from ``found`` one by one."""
-        return {topic: self._table(topic, found.pop(topic)) for topic in wanted}
+        """Return tables of some messages, which are removed from ``messages`` one by one."""
+        return {topic: self._table(topic, messages.pop(topic)) for topic in wanted}
 
-    def _table(self, topic: str, found: Messages) -> pd.DataFrame:
+    def _table(self, topic: str, messages: Messages) -> pd.DataFrame:
         import pandas as pd  # a third of a second, which only tables need
 
-        groups = self._groups(topic, found)
+        groups = self._groups(topic, messages)
         shift_ns = self._clock.shift_ns(topic)
         frames = [_frame(group, shift_ns) for group in groups]
         if not frames:

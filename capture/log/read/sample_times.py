@@ -353,9 +353,9 @@ def _steps(offset_s: FloatArray) -> IntArray:
     return steps.astype(np.int64)
 
 
-def _stamped_alike(one: Series, other: Series) -> bool:
-    if one.names != other.names or len({id(t_ns) for t_ns in (*one.t_ns, *other.t_ns)}) > 2:
+def _stamped_alike(series: Series, other: Series) -> bool:
+    if series.names != other.names or len({id(t_ns) for t_ns in (*series.t_ns, *other.t_ns)}) > 2:
         return False
     return all(
-        a is b or np.array_equal(a, b) for a, b in zip(one.t_ns[:1], other.t_ns[:1], strict=True)
+        a is b or np.array_equal(a, b) for a, b in zip(series.t_ns[:1], other.t_ns[:1], strict=True)
     )

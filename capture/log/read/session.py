@@ -40,7 +40,7 @@ def session_html(session: SessionView) -> str:
     rows = "".join(_row(channel, session.duration_s) for _, channel in topics[:MOST_TOPICS])
     left = len(topics) - MOST_TOPICS
     more = f"<p>{left} more topics in channels</p>" if left > 0 else ""
-    remarks = "".join(f"<li>{_text(one)}</li>" for one in session.warnings)
+    remarks = "".join(f"<li>{_text(warning)}</li>" for warning in session.warnings)
     warnings = f"<details open><summary>warnings</summary><ul>{remarks}</ul></details>"
     return (
         f"<p><strong>{_text(head)}</strong></p><table><thead><tr>{_HEAD}</tr></thead>"

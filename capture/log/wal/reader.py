@@ -481,12 +481,12 @@ class WalTail:
         room[:] = self._data[block.start : block.stop]
 
 
-def beyond(messages: Iterable[WalMessage], known: Collection[MessageKey]) -> list[WalMessage]:
+def beyond(messages: Iterable[WalMessage], keys: Collection[MessageKey]) -> list[WalMessage]:
     """Return the messages that a file lacks.
 
     Args:
-        known: Keys of the file's messages: at least of the last ones, as many as the log has.
+        keys: Keys of the file's messages: at least of the last ones, as many as the log has.
     """
     return [
-        item for item in messages if (item.channel_id, item.sequence, item.log_time_ns) not in known
+        item for item in messages if (item.channel_id, item.sequence, item.log_time_ns) not in keys
     ]

@@ -99,7 +99,7 @@ class Template:
         if len(t_ns) and t_ns.view(np.uint64).max() >= _END_NS:  # a negative one is huge
             raise DataError(f"times from {t_ns.min()} to {t_ns.max()} ns don't fit 32 bits of s")
         log_ns = t_ns if log_time_ns is None else log_time_ns
-        layout = self._layout(tuple((path, one.shape[1:]) for path, one in values.items()))
+        layout = self._layout(tuple((path, value.shape[1:]) for path, value in values.items()))
         size = layout.itemsize
         step = max(1, _AT_ONCE // size)
         records = np.empty((min(step, len(t_ns)), size), np.uint8)
