@@ -202,7 +202,7 @@ def _mean_plots(content: Content) -> list[rrb.View]:
         ("Mean power [W]", mean.power, None),
     ):
         if series:
-            contents = [series.entity for series in series]
+            contents = [channel.entity for channel in series]
             views.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
     return views
 
@@ -240,7 +240,7 @@ def _joint_plot(
     title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """Return a plot with a line for each joint; ``names`` are visible at first."""
-    contents = [series.entity for series in series]
+    contents = [channel.entity for channel in series]
     return plot(title, contents, overrides=_lines(series, names), legend=legend)
 
 

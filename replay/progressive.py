@@ -136,7 +136,7 @@ def _arrangement(content: Content) -> tuple[object, ...]:
 
 
 def _names(series: tuple[Series, ...]) -> tuple[str, ...]:
-    return tuple(name for series in series for name in series.names)
+    return tuple(name for channel in series for name in channel.names)
 
 
 def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:

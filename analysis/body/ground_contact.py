@@ -170,7 +170,7 @@ def cycle_loads(
 
     def averaged(series: Sequence[Series]) -> FloatArray:
         return np.stack(
-            [means_between(series.t_s, series.values, edges_s) for series in series], axis=-1
+            [means_between(channel.t_s, channel.values, edges_s) for channel in series], axis=-1
         )
 
     vertical = averaged(up)

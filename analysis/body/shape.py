@@ -207,7 +207,7 @@ def _cycles(series: Sequence[Series], span: Span) -> Iterator[FloatArray]:
     for first in range(0, span.cycles, _CYCLES):
         number = np.arange(first, min(first + _CYCLES, span.cycles))
         t_s = span.start_s + period * (number[:, None] + phase)
-        yield np.stack([series.at(t_s.ravel()).reshape(t_s.shape) for series in series], axis=-1)
+        yield np.stack([channel.at(t_s.ravel()).reshape(t_s.shape) for channel in series], axis=-1)
 
 
 def _share(part: FloatArray, whole: FloatArray) -> Estimate:

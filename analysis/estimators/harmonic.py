@@ -365,7 +365,7 @@ def fit_shared(
     """
     model = model or HarmonicModel()
     groups = _groups(series, model)
-    span = max(float(series.t_s[-1] - series.t_s[0]) for series in series)
+    span = max(float(channel.t_s[-1] - channel.t_s[0]) for channel in series)
     omega = omega_guess
     for _ in range(MAX_STEPS):
         solved = _solve_groups(groups, omega, model)

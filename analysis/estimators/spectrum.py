@@ -173,7 +173,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
             return common, common
         return common, _demodulated(group, fit, members, spans[members[0]])
 
-    found = in_threads(demodulated, groups, sum(series.count for series in series))
+    found = in_threads(demodulated, groups, sum(channel.count for channel in series))
     for members, (_, own) in zip(groups, found, strict=True):
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)

@@ -260,7 +260,7 @@ def sweep_data(
         responses.append(fit_tones(series, tones.omega, own))
         if all(name in effort for name in sweep.names):
             torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, own))
-        periods_s.append(max(commanded_series.period_s for commanded_series in commanded_series))
+        periods_s.append(max(signal.period_s for signal in commanded_series))
         drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if twin is None else twin.contact for twin in twins]
     at = list(sweep.tones)
@@ -283,12 +283,12 @@ def sweep_data(
 
 def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> FloatArray:
     """Return frequencies at which only a nonlinear robot responds."""
-    highest = NYQUIST_SHARE * 2 * np.pi / max(series.period_s for series in series)
+    highest = NYQUIST_SHARE * 2 * np.pi / max(channel.period_s for channel in series)
     if omega.size == 1:
         lines: FloatArray = omega[0] * np.array([2.0, 3.0])
         return lines[lines < highest]
     step = common_step(omega)
-    span = min(float(series.t_s[-1] - series.t_s[0]) for series in series)
+    span = min(float(channel.t_s[-1] - channel.t_s[0]) for channel in series)
     if step is None or step * span < 2 * np.pi * _PERIODS:
         return np.zeros(0)
     top = min(round((omega[-1] + 2 * omega[0]) / step), _MOST_LINES)
@@ -321,7 +321,7 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     """
     middle = float(series[0].t_s[0] + series[0].t_s[-1]) / 2
     ends = ((-np.inf, middle), (middle, np.inf))
-    halves = [[series.between(start, stop) for series in series] for start, stop in ends]
+    halves = [[channel.between(start, stop) for channel in series] for start, stop in ends]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
     tones = omega.size
     first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)

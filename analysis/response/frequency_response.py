@@ -131,7 +131,7 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
     if tones.size:
         middle = (start + stop) / 2
         for limits in (start, stop), (start, middle), (middle, stop):
-            command, response, *reference = (series.between(*limits) for series in series)
+            command, response, *reference = (channel.between(*limits) for channel in series)
             enough = response.count > 2 * tones.size + _SPARE
             yield (
                 sound_lines(tone_response(command, response, tones, looped=bool(reference)))
@@ -139,11 +139,11 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
                 else None
             )
         return
-    if min(series.count for series in series) <= _SPARE:
+    if min(channel.count for channel in series) <= _SPARE:
         yield from (None, None, None)
         return
-    t_s, step = even_times(start, stop, max(series.period_s for series in series))
-    even = [resampled(series, t_s) for series in series]
+    t_s, step = even_times(start, stop, max(channel.period_s for channel in series))
+    even = [resampled(channel, t_s) for channel in series]
     whole = _of_band(even, step)
     yield None if whole is None else sound_lines(whole)
     half = t_s.size // 2
@@ -221,8 +221,8 @@ def _log_spaced(low: float, high: float, count: int) -> FloatArray:
 
 def _unbroken(series: Sequence[Series]) -> list[Series]:
     """Return the longest stretch that all have without a long gap; short ones are bridged."""
-    start = max(series.t_s[0] for series in series)
-    stop = min(series.t_s[-1] for series in series)
+    start = max(channel.t_s[0] for channel in series)
+    stop = min(channel.t_s[-1] for channel in series)
     breaks = [(stop, start)] if start > stop else []
     for one in series:
         step = np.diff(one.t_s)
@@ -232,7 +232,7 @@ def _unbroken(series: Sequence[Series]) -> list[Series]:
     stops = [min([stop, *(before for before, _ in breaks if before >= start)]) for start in starts]
     k = int(np.argmax(np.subtract(stops, starts)))
     limits = starts[k], stops[k] + 1e-9
-    return [series.between(*limits) for series in series]
+    return [channel.between(*limits) for channel in series]
 
 
 def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]:

@@ -145,7 +145,7 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     common = find_rhythm(series, duration_s)
     if common is None:
         return None
-    moving = [series for series in series if series.name in common.names]
+    moving = [channel for channel in series if channel.name in common.names]
     size = np.sqrt(common.fit.total / common.fit.count)
     lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
     # Whether the common rhythm is each channel's own and not a subharmonic of it.
@@ -243,7 +243,7 @@ def _with_compound(
 
     def fitted(series: Sequence[Series], group: int) -> HarmonicFit | None:
         model = group_model(series, omegas, group, duration_s)
-        enough = all(series.count > model.size + 1 for series in series)
+        enough = all(channel.count > model.size + 1 for channel in series)
         return fit_at(series, omegas[group], model) if enough else None
 
     for one in rest:
@@ -388,11 +388,11 @@ def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
 
 def _highest(series: Sequence[Series]) -> float:
     """Highest frequency that the slowest channel's sampling rate allows [rad/s]."""
-    return NYQUIST_SHARE * 2 * np.pi / max(series.period_s for series in series)
+    return NYQUIST_SHARE * 2 * np.pi / max(channel.period_s for channel in series)
 
 
 def _most_lines(series: Sequence[Series]) -> int:
-    return min(series.count for series in series) // _SAMPLES_PER_LINE
+    return min(channel.count for channel in series) // _SAMPLES_PER_LINE
 
 
 def _candidates(

@@ -75,7 +75,9 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [series for series in series if series.count > MIN_SAMPLES and moves(series.values)]
+    moving = [
+        channel for channel in series if channel.count > MIN_SAMPLES and moves(channel.values)
+    ]
     if not moving or duration_s <= 0:
         return None
     scouts = liveliest(moving)
@@ -102,7 +104,7 @@ def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> Har
     Returns:
         One to ``HARMONICS`` harmonics.
     """
-    slowest = max(series.period_s for series in series)
+    slowest = max(channel.period_s for channel in series)
     highest = int(NYQUIST_SHARE * 2 * np.pi / (slowest * omega)) if slowest > 0 else 1
     return HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)), trend=trend)
 
@@ -170,7 +172,7 @@ def liveliest(series: Sequence[Series]) -> list[Series]:
 def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
     """Return the rhythm of the scouts near a frequency, and what it explains of all channels."""
     model = allowed_model(series, omega)
-    if any(series.count <= model.size + 1 for series in series):
+    if any(channel.count <= model.size + 1 for channel in series):
         return None
     try:
         fit = fit_at(scouts, omega, model)
@@ -182,7 +184,7 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
             fit = fit_at(series, fit.omega, model)
     except DataError:
         return None
-    return Rhythm(tuple(series.name for series in series), fit)
+    return Rhythm(tuple(channel.name for channel in series), fit)
 
 
 def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | None:

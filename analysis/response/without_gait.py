@@ -182,4 +182,4 @@ def why_no_gait(
 
 
 def _moving(series: Sequence[Series]) -> list[Series]:
-    return [series for series in series if series.count > MIN_SAMPLES and moves(series.values)]
+    return [channel for channel in series if channel.count > MIN_SAMPLES and moves(channel.values)]

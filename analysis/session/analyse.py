@@ -379,7 +379,9 @@ def _warn_dropped(
 ) -> None:
     for kind, series in (("command", commands), ("response", responses)):
         lost = [
-            series for series in series.values() if series.dropped_nan or series.dropped_duplicates
+            channel
+            for channel in series.values()
+            if channel.dropped_nan or channel.dropped_duplicates
         ]
         if lost:
             nan = sum(one.dropped_nan for one in lost)
@@ -388,7 +390,7 @@ def _warn_dropped(
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
-            few = nan + double <= _FEW * sum(series.count for series in series.values())
+            few = nan + double <= _FEW * sum(channel.count for channel in series.values())
             warn(Note(text) if few else text)
 
 

@@ -336,12 +336,12 @@ def _in_motion(
     origin = stretch.start_ns
     if not stated:
         soft = span
-        span = steady_part([series.between(span[0], span[1]) for series in series], *span)
+        span = steady_part([channel.between(span[0], span[1]) for channel in series], *span)
         start_s = span[0] if options.start_s is None else soft[0]
         span = start_s, span[1] if options.stop_s is None else soft[1]
         _warn_soft(soft, span, warn)
     start, stop = (origin + round(time_s * NS) for time_s in span)
-    period = max((series.period_s for series in series if series.count > 1), default=0.0)
+    period = max((channel.period_s for channel in series if channel.count > 1), default=0.0)
     # Moving to the last sample: that sample's own interval belongs to it.
     ends = stretch.stop_ns - stop <= 2 * round(period * NS)
     return stretch.intersect(start, None if ends else stop)

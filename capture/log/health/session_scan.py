@@ -220,7 +220,7 @@ class SessionScan:
         faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
-        first = [series.first_log_ns for series in series if series.topic == self._commands]
+        first = [channel.first_log_ns for channel in series if channel.topic == self._commands]
         commands_ns = min(first, default=None)
         for each in series:
             if each.topic not in framed:

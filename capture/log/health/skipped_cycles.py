@@ -41,13 +41,13 @@ def with_skipped_cycles(
     if not counted or not sources or not all(map(_is_whole, sources)):
         return tuple(series)
     skipped = [
-        series.timing for series in series if series.topic == commands and series.timing.gaps
+        channel.timing for channel in series if channel.topic == commands and channel.timing.gaps
     ]
     return tuple(
-        replace(series, timing=_all_late(series.timing))
-        if any(_same_cycles(series, timing, commands) for timing in skipped)
-        else series
-        for series in series
+        replace(channel, timing=_all_late(channel.timing))
+        if any(_same_cycles(channel, timing, commands) for timing in skipped)
+        else channel
+        for channel in series
     )
 
 

@@ -228,7 +228,7 @@ class JointReader:
         """
         keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
         series = {key: self._series(*key, messages, window_ns) for key in keys}
-        times = {key: list(series.t_ns) for key, series in series.items()}
+        times = {key: list(channel.t_ns) for key, channel in series.items()}
         for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
             own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
             stamped = [series[key] for key in own]
