@@ -211,7 +211,7 @@ def _runs(
     runs: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:
-            fitted = measure_session(session, options, with_dead_bands=False, with_body=False)
+            fitted = measure_session(session, options, without=("dead_band", "body"))
             runs.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
     return tuple(runs)
 

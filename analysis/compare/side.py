@@ -233,7 +233,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    measured = measure_session(session, options, with_dead_bands=False)
+    measured = measure_session(session, options, without=("dead_band",))
     analysis = measured.analysis
     run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)

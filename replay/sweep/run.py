@@ -249,7 +249,7 @@ def _results(setting: Setting, job: Job, path: Path) -> Row:
     scenario = scenario_of(setting, job.changes).changed(seed=job.seed)
     recording = record(scenario, path, kernels=setting.kernels)
     with Session.open(path) as session:
-        result = measure_session(session, options, with_dead_bands=False).analysis  # no column
+        result = measure_session(session, options, without=("dead_band",)).analysis  # no column
     return {
         "session_id": recording.session_id,
         "robot": scenario.robot.name,

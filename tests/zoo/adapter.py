@@ -152,7 +152,7 @@ def stated(signals: Signals) -> Said:
     """Return what undulog states of a session."""
     try:
         session = cast("SessionView", MemorySession(signals))
-        measured = measure_session(session, with_dead_bands=False, with_body=False)
+        measured = measure_session(session, without=("dead_band", "body"))
     except UndulogError as error:
         return Said((), (), False, False, True, sentence="", refused=str(error))
     answer = measured.analysis.answer
