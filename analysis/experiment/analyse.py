@@ -105,7 +105,7 @@ def analyse_experiment(
     chosen = [runs[k] for k in roles]
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
-    forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
+    forward, reverse = (y[[way is role for way in ways]] for role in (Role.FORWARD, Role.REVERSE))
     pooled = (
         pool_runs(chosen[0].names, [run.response for run in chosen])
         if len(set(ways)) == 1
@@ -114,8 +114,8 @@ def analyse_experiment(
     robot = examined.robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
-        own = [analyses[k] for k in roles]
-        joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
+        used = [analyses[k] for k in roles]
+        joints = used[0].answer if len(used) == 1 else pooled_answer(robot, pooled, used)
     reversal = None
     if not only_kicks and _both_ways(chosen, ways, names, robot, warn):
         reversal = _reversal(names, (forward, reverse), chosen, ways)
@@ -172,7 +172,7 @@ def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
     Raises:
         UsageError: If there is none.
     """
-    found = _Examined(options)
+    examined = _Examined(options)
     for session in sessions:
         measured = measure_session(session, options)
         analysis, gait, robot = measured.analysis, measured.gait, session.robot
@@ -180,16 +180,16 @@ def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
         del measured  # heavy: no two at a time
         label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
         name = analysis.session.robot
-        found.runs.append(gait_run(label, robot, analysis, gait, lay))
-        found.analyses.append(analysis)
-        found.gaits.append(gait)
-        found.cycles.append(None if cycle is None else GaitSession(analysis.session.path, cycle))
-        found.robots.append(robot)
-        found.commanded.append(command_tones(session, options, gait, name))
-        found.periodic.append(multisine_run(session, options, name) if gait is None else None)
-    if not found.runs:
+        examined.runs.append(gait_run(label, robot, analysis, gait, lay))
+        examined.analyses.append(analysis)
+        examined.gaits.append(gait)
+        examined.cycles.append(None if cycle is None else GaitSession(analysis.session.path, cycle))
+        examined.robots.append(robot)
+        examined.commanded.append(command_tones(session, options, gait, name))
+        examined.periodic.append(multisine_run(session, options, name) if gait is None else None)
+    if not examined.runs:
         raise UsageError("an experiment needs at least one session")
-    return found
+    return examined
 
 
 def _experiment(
@@ -214,8 +214,8 @@ def _experiment(
         "reversal": None,
         "sessions": tuple(examined.analyses),
         "runs": tuple(
-            Run(one.session.id, one.session.path, run.wave, roles.get(k), reasons.get(k))
-            for k, (one, run) in enumerate(zip(examined.analyses, examined.runs, strict=True))
+            Run(analysis.session.id, analysis.session.path, run.wave, roles.get(k), reasons.get(k))
+            for k, (analysis, run) in enumerate(zip(examined.analyses, examined.runs, strict=True))
         ),
         "warnings": tuple(examined.warnings),
         "provenance": _provenance(examined.analyses, examined.options),
@@ -240,9 +240,9 @@ def _of_perturbed(
 ) -> Experiment:
     """Return the experiment of gaits around one gait, each other than the rest."""
     examined.leave_out(apart)
-    known = [len(gait.all_answered) for gait in examined.gaits if gait is not None]
+    answered = [len(gait.all_answered) for gait in examined.gaits if gait is not None]
     coupling = replace(
-        coupling_of_one_gait(min(known, default=0)),
+        coupling_of_one_gait(min(answered, default=0)),
         why="gaits perturbed as a whole do not tell the effect of one joint's command from that of "
         "the others",
     )
@@ -254,11 +254,11 @@ def _of_perturbed(
 def _of_multisine(multisine: MultisineRuns, examined: _Examined) -> Experiment:
     """Return the experiment of random-phase multisines over a band."""
     examined.leave_out(multisine.why)
-    found = best_linear_responses(multisine.runs, examined.warn)
+    best_linear = best_linear_responses(multisine.runs, examined.warn)
     roles = dict.fromkeys(multisine.index, "multisine")
-    answer = broken_first(examined.analyses, multisine_answer(found))
+    answer = broken_first(examined.analyses, multisine_answer(best_linear))
     coupling = coupling_of_one_gait(0)
-    return _experiment(examined, roles, multisine.why, answer, coupling, best_linear=found)
+    return _experiment(examined, roles, multisine.why, answer, coupling, best_linear=best_linear)
 
 
 def _reversal(
@@ -340,8 +340,8 @@ def _warn_headings(reversal: Reversal, warn: Warn) -> None:
     """Warn where a tilted floor isn't cancelled and could change what is named."""
     if reversal.p >= SIGNIFICANT or reversal.tilt.headings is Headings.BALANCED:
         return
-    known = reversal.tilt.headings is not Headings.UNKNOWN
-    why = "headings are not balanced" if known else "heading is not recorded"
+    recorded = reversal.tilt.headings is not Headings.UNKNOWN
+    why = "headings are not balanced" if recorded else "heading is not recorded"
     warn(
         f"the robot's {why}, so a tilted floor doesn't cancel; turn the robot by half a turn "
         "in half of the runs of each direction (undulog plan reversal)"
@@ -354,7 +354,7 @@ def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
     return Provenance(
         command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),
         versions=base_versions(),
-        inputs={path: one.provenance.inputs[path] for path, one in named},
+        inputs={path: analysis.provenance.inputs[path] for path, analysis in named},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

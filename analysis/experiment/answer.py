@@ -105,11 +105,11 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
     """Yield the sentences that follow the answer."""
     yield from kick_checks(coupling)
-    for one in coupling.held_out:
+    for prediction in coupling.held_out:
         yield (
-            f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
-            f"{100 * one.error:.2f} % (noise {100 * one.noise:.2f} %), 'each joint keeps its "
-            f"response' {100 * one.error_kept:.2f} %."
+            f"Held out, {prediction.session}: deviations up to {prediction.size:.3f}, error "
+            f"{100 * prediction.error:.2f} % (noise {100 * prediction.noise:.2f} %), "
+            f"'each joint keeps its response' {100 * prediction.error_kept:.2f} %."
         )
     if coupling.valid_to is not None:
         yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
@@ -152,7 +152,7 @@ def _bands(model: Lti | ToneCoupling, joint: str = "", joints: str = "") -> str:
 
 def _scatter(scatter: RunScatter) -> str:
     """Describe how much runs differ, in degrees and percent."""
-    phase, gain = (np.array(one) for one in (scatter.phase_rad, scatter.log_gain))
+    phase, gain = (np.array(values) for values in (scatter.phase_rad, scatter.log_gain))
     noise = np.degrees(np.median(scatter.phase_noise_rad))
     widened = "" if scatter.widened <= 1 else f"; errors widened by up to {scatter.widened:.2g}"
     return (

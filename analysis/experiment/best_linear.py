@@ -68,7 +68,7 @@ def best_linear_responses(runs: Sequence[MultisineRun], warn: Warn) -> BestLinea
     lines: IntArray = np.array(design.lines)
     freedom = len(groups) - 1 or (periods - 1) * len(groups[0])
     whole = [_inverse(group, range(len(names))) for group in groups] if orthogonal else None
-    found: list[BestLinearJoint] = []
+    results: list[BestLinearJoint] = []
     cross: list[CrossResponse] = []
     for joint in joints:
         place = names.index(joint)
@@ -76,37 +76,37 @@ def best_linear_responses(runs: Sequence[MultisineRun], warn: Warn) -> BestLinea
         spectra = [
             np.stack([run.response[joint][:periods] for run in group]) for group in groups
         ]  # (E, P, n) each
-        each = [
-            realisation_response(inverse, one[:, :, lines])
-            for inverse, one in zip(inverses, spectra, strict=True)
+        estimates = [
+            realisation_response(inverse, spectrum[:, :, lines])
+            for inverse, spectrum in zip(inverses, spectra, strict=True)
         ]
         spread = _spread(groups, place, lines)
         every = [
             over_realisations(
-                np.stack([value[k] for value, _ in each]),
-                np.stack([noise[k] for _, noise in each]),
+                np.stack([value[k] for value, _ in estimates]),
+                np.stack([noise[k] for _, noise in estimates]),
                 spread.excited,
             )
-            for k in range(len(each[0][0]))
+            for k in range(len(estimates[0][0]))
         ]
-        own = every[place if orthogonal else 0]
+        approximation = every[place if orthogonal else 0]
         sharing = () if orthogonal else tuple(name for name in names if name != joint)
-        one = _joint(joint, sharing, own, freedom, lines / design.period_s)
-        if one is None:
+        result = _joint(joint, sharing, approximation, freedom, lines / design.period_s)
+        if result is None:
             warn(f"{joint}: no line has a response with an interval; it is left out")
             continue
         if periods > 1 and (lines % 2 == 1).all():
             powers = [line_power(y).mean(axis=0) for y in spectra]
             beside = detection_lines(powers, lines, spread)
-            one = replace(one, odd=beside.odd, even=beside.even)
-        found.append(one)
+            result = replace(result, odd=beside.odd, even=beside.even)
+        results.append(result)
         if orthogonal:
             cross += [
                 _cross(joint, name, other)
                 for name, other in zip(names, every, strict=True)
                 if name != joint
             ]
-    if not found:
+    if not results:
         return None
     return BestLinearResponses(
         inputs="orthogonal" if orthogonal else "same",
@@ -114,7 +114,7 @@ def best_linear_responses(runs: Sequence[MultisineRun], warn: Warn) -> BestLinea
         periods=periods,
         period_s=design.period_s,
         lines=design.lines,
-        joints=tuple(found),
+        joints=tuple(results),
         cross=tuple(cross),
     )
 
@@ -127,11 +127,11 @@ def _realisations(
     for run in runs:
         by_number.setdefault(run.design.realisation, []).append(run)
     m = len(runs[0].names)
-    found: list[list[MultisineRun]] = []
+    usable: list[list[MultisineRun]] = []
     for number, group in sorted(by_number.items()):
         if not orthogonal:
             if all(run.shared for run in group):
-                found.append(group)
+                usable.append(group)
             else:
                 warn(
                     f"realisation {number} is left out: its joints have different commands, though "
@@ -143,13 +143,13 @@ def _realisations(
             matrices = np.moveaxis(np.stack([run.command for run in group], axis=1), 2, 0)
             regular = bool(np.linalg.cond(matrices).max() <= MOST_CONDITION)
         if regular:
-            found.append(group)
+            usable.append(group)
         else:
             warn(
                 f"realisation {number} is left out: its {len(group)} runs don't have the {m} "
                 f"independent commands of {m} joints"
             )
-    return found
+    return usable
 
 
 def _spread(
@@ -172,8 +172,8 @@ def _warn_inputs(runs: Sequence[MultisineRun], counts: tuple[int, int], warn: Wa
             "leave out: distortion of odd and even order holds what the joints make of that"
         )
     if min(counts) < 2:
-        one = "realisation" if counts[0] < 2 else "period"
-        warn(f"one {one}: nonlinear distortion is not separable from noise")
+        unit = "realisation" if counts[0] < 2 else "period"
+        warn(f"one {unit}: nonlinear distortion is not separable from noise")
 
 
 def _joint(
@@ -191,11 +191,11 @@ def _joint(
         return None
     kept = np.isin(frequency_hz, lines.frequency_hz)
     response = joint_response(joint, str(Kind.PERIODIC), sharing, lines)
-    known = approximation.relative_distortion.value is not None
+    separable = approximation.relative_distortion.value is not None
     return BestLinearJoint(
         response=replace(response, distortion=approximation.relative_distortion.value),
         noise_sd=_root(approximation.noise[kept]),
-        distortion_sd=_root(approximation.distortion[kept]) if known else None,
+        distortion_sd=_root(approximation.distortion[kept]) if separable else None,
         distortion=approximation.relative_distortion,
         odd=Estimate(),
         even=Estimate(),
@@ -235,7 +235,7 @@ def multisine_answer(responses: BestLinearResponses | None) -> str:
         f"{responses.realisations} realisation{'s' if responses.realisations > 1 else ''} of "
         f"{responses.periods} period{'s' if responses.periods > 1 else ''}"
     )
-    worst = max(responses.joints, key=lambda one: one.distortion.value or 0.0)
+    worst = max(responses.joints, key=lambda joint: joint.distortion.value or 0.0)
     if worst.distortion.value is None:
         return f"{lead}: nonlinear distortion is not separable from noise"
     return f"{lead}: {_distortion(worst, count)}"

@@ -61,36 +61,36 @@ def body_connection(
         The model, or the reason why there is none; None where no session has a cycle. And by index
         why a session has no part in it.
     """
-    known = {k: session for k, session in enumerate(sessions) if session is not None}
-    if not known:
+    gaits = {k: session for k, session in enumerate(sessions) if session is not None}
+    if not gaits:
         return None, {}
     why = dict.fromkeys(
         (k for k, session in enumerate(sessions) if session is None),
         "has no planar gait with the head's pose and all joint angles",
     )
-    joints = next(iter(known.values())).cycle.joints
-    other = {k: "has other joints" for k, one in known.items() if one.cycle.joints != joints}
+    joints = next(iter(gaits.values())).cycle.joints
+    other = {k: "has other joints" for k, gait in gaits.items() if gait.cycle.joints != joints}
     seen: dict[bytes, int] = {}
-    for k, one in known.items():
-        first = seen.setdefault(one.cycle.shape.tobytes(), k)
+    for k, gait in gaits.items():
+        first = seen.setdefault(gait.cycle.shape.tobytes(), k)
         if first != k:
             other[k] = "is a copy of another session"
-    used = [k for k in known if k not in other]
-    off = distances([known[k].cycle for k in used])
+    used = [k for k in gaits if k not in other]
+    off = distances([gaits[k].cycle for k in used])
     far = {
         k: f"is another gait: its joint angles differ from the central one by {100 * share:.0f} %"
         for k, share in zip(used, off.tolist(), strict=True)
         if share > MOST_DISTANCE
     }
     near = [k for k in used if k not in far]
-    middle = float(np.median([known[k].cycle.omega for k in near]))
+    middle = float(np.median([gaits[k].cycle.omega for k in near]))
     fast = {
         k: f"has another speed: its frequency is {factor:.3g} times the median of the sessions"
         for k in near
-        if not 1 / SPEED_IN_MODEL <= (factor := known[k].cycle.omega / middle) <= SPEED_IN_MODEL
+        if not 1 / SPEED_IN_MODEL <= (factor := gaits[k].cycle.omega / middle) <= SPEED_IN_MODEL
     }
     inside = [k for k in near if k not in fast]
-    result = _result({k: known[k] for k in used}, inside)
+    result = _result({k: gaits[k] for k in used}, inside)
     return result, why | other | far | fast
 
 
@@ -130,10 +130,10 @@ def _entries(model: Connection) -> tuple[ConnectionEntry, ...]:
 
 
 def _held_out(
-    sessions: dict[int, GaitSession], inside: Sequence[int], model: Connection, own: int
+    sessions: dict[int, GaitSession], inside: Sequence[int], model: Connection, index: int
 ) -> PredictedTravel:
     """Predict a session from the others."""
-    session, nothing = sessions[own], Estimate()
+    session, nothing = sessions[index], Estimate()
     cycle = session.cycle
     forward, left, turn = map(mean_step, cycle.steps.T)
     measured = PredictedTravel(
@@ -141,10 +141,10 @@ def _held_out(
         *(nothing, nothing, nothing),
         *(forward, left, turn),
     )
-    others = [sessions[k].cycle for k in inside if k != own]
+    others = [sessions[k].cycle for k in inside if k != index]
     ratio = _speed_ratio(cycle, others)
     try:
-        if own in inside:
+        if index in inside:
             model = fit_connection(others)
         why = model.outside(cycle.shape)
     except DataError as error:
@@ -158,8 +158,8 @@ def _held_out(
         return replace(measured, why=why)
     value, half = model.predict(cycle.shape)
     forward, left, turn = (
-        Estimate(one, around(one, width) if ratio <= SAME_SPEED else None)
-        for one, width in zip(value.tolist(), half.tolist(), strict=True)
+        Estimate(step, around(step, width) if ratio <= SAME_SPEED else None)
+        for step, width in zip(value.tolist(), half.tolist(), strict=True)
     )
     return replace(measured, forward_m=forward, left_m=left, turn_rad=turn)
 
@@ -172,18 +172,20 @@ def _speed_ratio(cycle: GaitCycle, others: Sequence[GaitCycle]) -> float:
 
 def connection_answer(connection: BodyConnection) -> str:
     """Answer from the model in one sentence without its full stop."""
-    known = [one for one in connection.predicted if one.why is None]
+    travels = [travel for travel in connection.predicted if travel.why is None]
     lead = f"how shape moves the body, from {connection.why} (effective, first order)"
-    if not known:
+    if not travels:
         return f"{lead}: no session is within the range of the others, so none is predicted"
-    distance = [(np.hypot(_of(one.forward_m), _of(one.left_m)), _gone(one)) for one in known]
+    distance = [
+        (np.hypot(_of(travel.forward_m), _of(travel.left_m)), _gone(travel)) for travel in travels
+    ]
     off = float(np.median([abs(a - b) for a, b in distance]))
     gone = float(np.median([b for _, b in distance]))
-    turn = [abs(_of(one.turn_rad) - _of(one.measured_turn_rad)) for one in known]
-    outside = len(connection.predicted) - len(known)
+    turn = [abs(_of(travel.turn_rad) - _of(travel.measured_turn_rad)) for travel in travels]
+    outside = len(connection.predicted) - len(travels)
     rest = f"; {outside} outside the range of the others" if outside else ""
     return (
-        f"{lead}: each of {len(known)} sessions predicted from the others, median error of a "
+        f"{lead}: each of {len(travels)} sessions predicted from the others, median error of a "
         f"cycle's displacement {formats.number(1000 * off, 1)} mm of "
         f"{formats.number(1000 * gone, 0)} mm, of its turn "
         f"{formats.number(float(np.degrees(np.median(turn))), 2)}°{rest}"
@@ -205,17 +207,19 @@ def connection_detail(connection: BodyConnection) -> list[str]:
         "infinite" if connection.condition_number is None else f"{connection.condition_number:.3g}"
     )
     if connection.identified:
-        known = "the connection A is identified (--json)"
+        verdict = "the connection A is identified (--json)"
     else:
-        known = (
+        verdict = (
             "the connection A itself is not identified, only what perturbations of these kinds do"
         )
     modes = f"Shape modes with {shares} of the variance of all shapes"
     lines = [
-        f"{modes}; condition number {number}: {known}.",
+        f"{modes}; condition number {number}: {verdict}.",
         formats.sentence(f"the model is {connection.label}"),
     ]
-    bare = sum(one.why is None and one.forward_m.ci95 is None for one in connection.predicted)
+    bare = sum(
+        travel.why is None and travel.forward_m.ci95 is None for travel in connection.predicted
+    )
     if bare:
         lines.append(
             f"No interval for {bare} of the predictions: the gait's frequency is more than "

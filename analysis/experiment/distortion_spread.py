@@ -86,11 +86,11 @@ def _of_responses(responses: ComplexArray, chosen: IntArray) -> Spread:
         return Spread()
     off = responses - responses.mean(axis=0)
     gram = np.real(off @ off.conj().T)
-    own = np.diag(gram)
+    squares = np.diag(gram)
     count = chosen.shape[1]
-    total = own[chosen].sum(axis=1)
+    total = squares[chosen].sum(axis=1)
     across = gram[chosen[:, :, None], chosen[:, None, :]].sum(axis=(1, 2)) / count
-    expected = float(own.mean())
+    expected = float(squares.mean())
     if expected <= ROUNDING * float(np.mean(np.abs(responses) ** 2)):
         return Spread()
     return _quantiles((total - across) / (count - 1), expected)

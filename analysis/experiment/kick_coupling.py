@@ -188,8 +188,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     used = [*experiment.runs.base, *kicks]
     m = len(experiment.names)
     plan = f"phase-kicks around this gait ({4 * m} runs and one without a kick)"
-    known = np.isfinite(experiment.ratio[used])
-    if lost := [name for i, name in enumerate(experiment.names) if not known[:, i].all()]:
+    finite = np.isfinite(experiment.ratio[used])
+    if lost := [name for i, name in enumerate(experiment.names) if not finite[:, i].all()]:
         return Coupling(
             identifiable=False,
             why=f"{', '.join(lost)}: gain and lag are not known in every run, so rows of the "
@@ -208,25 +208,25 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
     # ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
     change = experiment.runs.deviation + np.log(experiment.ratio / base)
-    each = [kicks.get(k) for k in used]
+    used_kicks = [kicks.get(k) for k in used]
     answers = ResponseMatrices(
         change, experiment.log_gain_variance, experiment.lag_variance, experiment.dof
     ).select(used)
-    found = local_matrices(each, answers, amplitude=_has_amplitude(experiment, warn))
-    P, R, G, S = found.P, found.R, found.G, found.S
-    correlation = found.errors.correlation
-    size = kick_size(each, answers, found)
+    matrices = local_matrices(used_kicks, answers, amplitude=_has_amplitude(experiment, warn))
+    P, R, G, S = matrices.P, matrices.R, matrices.G, matrices.S
+    correlation = matrices.errors.correlation
+    size = kick_size(used_kicks, answers, matrices)
     reading = lti_reading(
         P, R, base * experiment.command, experiment.command, correlation=correlation
     )
-    held = _held_out(experiment, change, base, found)
+    held = _held_out(experiment, change, base, matrices)
     reached = valid_to(held)
-    passed = bool(found.agree.all())
+    passed = bool(matrices.agree.all())
     if not passed:
         warn(
             "rows of P don't sum to 1, or rows of R to 0, within their errors, as shifting time "
             "demands of any settled gait: let each run settle longer before it is measured; errors "
-            f"are widened by up to {found.widened.max():.2g}"
+            f"are widened by up to {matrices.widened.max():.2g}"
         )
     if size.why is not None:
         warn(size.why)
@@ -252,8 +252,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         R=_matrix(R),
         G=None if G is None else _matrix(G),
         S=None if S is None else _matrix(S),
-        phase_rows=_rows(experiment.names, found.phase_rows, 1.0),
-        gain_rows=_rows(experiment.names, found.gain_rows, 0.0),
+        phase_rows=_rows(experiment.names, matrices.phase_rows, 1.0),
+        gain_rows=_rows(experiment.names, matrices.gain_rows, 0.0),
         checks_pass=passed,
         nonlinearity=Estimate()
         if G is None or S is None
@@ -261,8 +261,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         lti=reading,
         held_out=held,
         valid_to=reached,
-        base=_base_response(experiment, base, found.errors),
-        scatter=_scatter(found),
+        base=_base_response(experiment, base, matrices.errors),
+        scatter=_scatter(matrices),
         kick_size=size,
     )
 
@@ -279,17 +279,17 @@ def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
 
 
 def _held_out(
-    experiment: KickExperiment, change: ComplexArray, base: ComplexArray, found: LocalMatrices
+    experiment: KickExperiment, change: ComplexArray, base: ComplexArray, local: LocalMatrices
 ) -> tuple[HeldOut, ...]:
     """Predict the held-out runs."""
-    G, S = found.G, found.S
+    G, S = local.G, local.S
     matrices = (
-        found.P.value,
-        found.R.value,
+        local.P.value,
+        local.R.value,
         None if G is None else G.value,
         None if S is None else S.value,
     )
-    between = found.errors.between.reshape(2, -1).sum(axis=0)
+    between = local.errors.between.reshape(2, -1).sum(axis=0)
     variance = experiment.log_gain_variance + experiment.lag_variance + between
     response = base * experiment.command
     deviation = experiment.runs.deviation
@@ -305,7 +305,7 @@ def _held_out(
 def _rows(names: Sequence[str], sums: NoisyMatrix, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
-    numbers = (one.tolist() for one in (sums.value, half, sums.error))
+    numbers = (values.tolist() for values in (sums.value, half, sums.error))
     return tuple(
         RowCheck(name, expected, Estimate(total, around(total, wide)), error)
         for name, total, wide, error in zip(names, *numbers, strict=True)

@@ -125,8 +125,8 @@ def _generators(
     dof = np.full_like(error, coupling.scatter.dof if coupling.scatter is not None else np.inf)
     dof = np.minimum(dof, 1e6)
     of_base = NoisyMatrix(np.zeros_like(error), error, dof, correlation)
-    own = noise_draws(of_base, SEED + 1)[..., 0]
-    turned = felt * np.exp(own[:, m:] + 1j * own[:, :m])
+    base_noise = noise_draws(of_base, SEED + 1)[..., 0]
+    turned = felt * np.exp(base_noise[:, m:] + 1j * base_noise[:, :m])
     drawn = relaxation(P.value + noise[:, :m], R.value + noise[:, m:], turned)
     return relaxation(P.value, R.value, felt), drawn
 
@@ -136,9 +136,9 @@ def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float)
     times = np.linspace(0.0, until_s, POINTS + 1)
     step = float(times[1])
 
-    def followed(one: FloatArray) -> FloatArray:
-        along = np.asarray(expm(one * step), dtype=np.float64)
-        now = np.broadcast_to(kick, (*one.shape[:-2], len(kick))).copy()
+    def followed(generator: FloatArray) -> FloatArray:
+        along = np.asarray(expm(generator * step), dtype=np.float64)
+        now = np.broadcast_to(kick, (*generator.shape[:-2], len(kick))).copy()
         rows = [now]
         for _ in range(POINTS):
             now = np.einsum("...ij,...j->...i", along, now)
@@ -159,32 +159,34 @@ def _limits(
     coupling: LocalCoupling, fastest: float, omega: float, kick: Mapping[str, float]
 ) -> list[str]:
     """List the limits of the prediction, worst first."""
-    found: list[str] = []
+    limits: list[str] = []
     if not coupling.checks_pass:
-        found.append("P's rows don't sum to 1 within their errors: the prediction is doubtful")
+        limits.append("P's rows don't sum to 1 within their errors: the prediction is doubtful")
     size = coupling.kick_size
     if size is not None and size.why is not None:
-        found.append(size.why)
+        limits.append(size.why)
     if fastest > SLOW * omega:
-        found.append(
+        limits.append(
             f"phases relax at up to {fastest:.2g} 1/s, more than {SLOW:g} of the gait's "
             f"{omega:.2g} rad/s: the average over a cycle doesn't hold; take a smaller eps"
         )
-    largest = max((abs(one) for one in kick.values()), default=0.0)
+    largest = max((abs(deviation) for deviation in kick.values()), default=0.0)
     if coupling.valid_to is None:
-        found.append("how far from the gait it holds isn't known: no held-out run shows it")
+        limits.append("how far from the gait it holds isn't known: no held-out run shows it")
     elif largest > coupling.valid_to:
-        found.append(
+        limits.append(
             f"the kick of {largest:.2g} rad is beyond {coupling.valid_to:.2g} rad, as far as "
             "held-out runs were predicted"
         )
     else:
-        found.append(f"holds for deviations up to {coupling.valid_to:.2g} rad, as held-out runs do")
-    found.append(
+        limits.append(
+            f"holds for deviations up to {coupling.valid_to:.2g} rad, as held-out runs do"
+        )
+    limits.append(
         "holds around the gait that was kicked alone, and for phases that move slowly against the "
         "time in which the body settles"
     )
-    return found
+    return limits
 
 
 def _answer(modes: tuple[LoopMode, ...], eps: float) -> str:
@@ -196,7 +198,9 @@ def _answer(modes: tuple[LoopMode, ...], eps: float) -> str:
         (grows, "grows", "grow"),
         (len(modes) - grows - relaxes, "may do either", "may do either"),
     )
-    parts = [f"{count} {one if count == 1 else more}" for count, one, more in counts if count]
+    parts = [
+        f"{count} {singular if count == 1 else more}" for count, singular, more in counts if count
+    ]
     return (
         f"with feedback of {eps:g} 1/s and the body as the only coupling, of {len(modes)} patterns "
         f"of the phases {', '.join(parts)}; the slowest has the rate "

@@ -123,8 +123,8 @@ def sort_kicks(command: ComplexArray) -> KickedRuns | None:
         of ``LEAST_KICK`` to ``MOST_PATTERN``, which are too small or too large for most robots.
         None where they are no kick experiment: see :func:`sort_kicks_within`.
     """
-    found = sort_kicks_within(command, SAME, MOST_KICK)
-    return sort_kicks_within(command, LEAST_KICK, MOST_PATTERN) if found is None else found
+    kicked = sort_kicks_within(command, SAME, MOST_KICK)
+    return sort_kicks_within(command, LEAST_KICK, MOST_PATTERN) if kicked is None else kicked
 
 
 def sort_kicks_within(command: ComplexArray, same: float, most: float) -> KickedRuns | None:
@@ -143,12 +143,12 @@ def sort_kicks_within(command: ComplexArray, same: float, most: float) -> Kicked
     best: KickedRuns | None = None
     tried: list[ComplexArray] = []
     for model in command:
-        if any(np.abs(deviation_of(model, one, same)).max() <= same for one in tried):
+        if any(np.abs(deviation_of(model, earlier, same)).max() <= same for earlier in tried):
             continue
         tried.append(model)
-        found = _around(command, model, same, most)
-        if best is None or len(found.kicks) > len(best.kicks):
-            best = found
+        kicked = _around(command, model, same, most)
+        if best is None or len(kicked.kicks) > len(best.kicks):
+            best = kicked
     if best is None:
         return None
     different = {(kick.joint, kick.kind, kick.size > 0) for kick in best.kicks.values()}
@@ -180,13 +180,13 @@ def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tu
 
 
 def _around(command: ComplexArray, model: ComplexArray, same: float, most: float) -> KickedRuns:
-    deviation = np.stack([deviation_of(one, model, same) for one in command])
+    deviation = np.stack([deviation_of(row, model, same) for row in command])
     base: list[int] = []
     kicks: dict[int, Kick] = {}
     patterns: list[int] = []
-    for k, one in enumerate(deviation):
-        kick = kick_of(one, same, most)
-        largest = max(np.abs(one.real).max(), np.abs(one.imag).max())
+    for k, row in enumerate(deviation):
+        kick = kick_of(row, same, most)
+        largest = max(np.abs(row.real).max(), np.abs(row.imag).max())
         if kick is not None:
             kicks[k] = kick
         elif largest <= same:
@@ -227,9 +227,9 @@ class KickExperiment:
         """Return a run's role: ``base``, ``kick``, ``held-out`` or None."""
         if k not in self.index:
             return None
-        own, runs = self.index.index(k), self.runs
+        place, runs = self.index.index(k), self.runs
         parts = {"kick": runs.kicks, "held-out": runs.patterns, "base": runs.base}
-        return next((name for name, members in parts.items() if own in members), None)
+        return next((name for name, members in parts.items() if place in members), None)
 
 
 def find_kicks(runs: Sequence[GaitRun]) -> KickExperiment | None:
@@ -245,9 +245,9 @@ def find_kicks(runs: Sequence[GaitRun]) -> KickExperiment | None:
         if index in seen or len(model.names) < 3 or len(model.frequencies_hz) > 1:
             continue
         seen.append(index)
-        found = sort_kicks(np.stack([runs[k].command for k in index]))
-        if found is not None and (best is None or len(found.kicks) > len(best.runs.kicks)):
-            best = _experiment(index, found, [runs[k] for k in index])
+        kicked = sort_kicks(np.stack([runs[k].command for k in index]))
+        if kicked is not None and (best is None or len(kicked.kicks) > len(best.runs.kicks)):
+            best = _experiment(index, kicked, [runs[k] for k in index])
     return best
 
 
@@ -260,12 +260,12 @@ def _same_drive(run: GaitRun, model: GaitRun) -> bool:
 
 
 def _experiment(
-    index: tuple[int, ...], found: KickedRuns, runs: Sequence[GaitRun]
+    index: tuple[int, ...], kicked: KickedRuns, runs: Sequence[GaitRun]
 ) -> KickExperiment:
-    base, responses = runs[found.base[0]], [run.response for run in runs]
+    base, responses = runs[kicked.base[0]], [run.response for run in runs]
     return KickExperiment(
         index=index,
-        runs=found,
+        runs=kicked,
         names=base.names,
         command=base.command,
         ratio=np.stack([response.ratio for response in responses]),

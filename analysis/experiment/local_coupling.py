@@ -193,7 +193,7 @@ def stacked(blocks: Sequence[Sequence[NoisyMatrix]], correlation: FloatArray | N
     """
 
     def block(part: str) -> FloatArray:
-        return np.block([[getattr(one, part) for one in row] for row in blocks])
+        return np.block([[getattr(matrix, part) for matrix in row] for row in blocks])
 
     return NoisyMatrix(block("value"), block("error"), block("dof"), correlation)
 
@@ -267,7 +267,7 @@ def squared(share: Estimate) -> Estimate:
     """
     if share.value is None:
         return share
-    value, *ends = (min(1.0, one**2) for one in (share.value, *(share.ci95 or ())))
+    value, *ends = (min(1.0, ratio**2) for ratio in (share.value, *(share.ci95 or ())))
     return Estimate(value, (ends[0], ends[1]) if ends else None)
 
 
@@ -310,11 +310,11 @@ def local_matrices(
         amplitude: Whether amplitudes are kicked both ways, too.
     """
     kicked = [k for k, kick in enumerate(kicks) if kick is not None]
-    each = [kick for kick in kicks if kick is not None]
+    used = [kick for kick in kicks if kick is not None]
     of_kicks = answers.select(kicked)
 
     def differences(errors: RunErrors | None, kind: Kind) -> tuple[NoisyMatrix, NoisyMatrix]:
-        return central_differences(each, replace(of_kicks, errors=errors), kind)
+        return central_differences(used, replace(of_kicks, errors=errors), kind)
 
     phase, log_gain = differences(None, Kind.PHASE)
     derivatives = ((phase.value - 1j * log_gain.value).astype(np.complex128), None)
@@ -327,7 +327,7 @@ def local_matrices(
         for pairs, rows in ((True, False), (True, True), (False, True))
     )
     sums = [row_sums(difference) for difference in differences(without, Kind.PHASE)]
-    agree = np.stack([_agree(one, to) for one, to in zip(sums, (1.0, 0.0), strict=True)])
+    agree = np.stack([_agree(total, to) for total, to in zip(sums, (1.0, 0.0), strict=True)])
     widened = np.stack(list(map(_widening, sums, (1.0, 0.0), agree)))
     P, R = _widen(differences(errors, Kind.PHASE), widened)
     S, G = _widen(differences(errors, Kind.AMPLITUDE), widened) if amplitude else (None, None)

@@ -220,7 +220,7 @@ class Strata:
     def count(self) -> int:
         """How many labellings there are."""
         pairs = zip(self.plus.tolist(), self.minus.tolist(), strict=True)
-        return math.prod(math.comb(one + other, one) for one, other in pairs)
+        return math.prod(math.comb(plus + minus, plus) for plus, minus in pairs)
 
     @property
     def symmetric(self) -> bool:
@@ -244,16 +244,16 @@ class Strata:
             Genet. Mol. Biol. 9, 2010).
         """
         observed = np.arange(len(self.index)) < int(self.plus.sum())
-        own: list[IntArray] = [np.flatnonzero(self.index == s) for s in range(self.strata)]
+        stratum_runs: list[IntArray] = [np.flatnonzero(self.index == s) for s in range(self.strata)]
         if self.count > MOST_LABELLINGS:
             random = np.random.default_rng(1)
             drawn = np.zeros((RANDOM_LABELLINGS, len(self.index)), dtype=np.bool_)
-            for runs, plus in zip(own, self.plus.tolist(), strict=True):
+            for runs, plus in zip(stratum_runs, self.plus.tolist(), strict=True):
                 order = random.random((RANDOM_LABELLINGS, len(runs))).argsort(axis=1)
                 drawn[:, runs] = order.argsort(axis=1) < plus
             return np.concatenate([observed[None], drawn])
         labels = np.zeros((1, len(self.index)), dtype=np.bool_)
-        for s, (runs, plus) in enumerate(zip(own, self.plus.tolist(), strict=True)):
+        for s, (runs, plus) in enumerate(zip(stratum_runs, self.plus.tolist(), strict=True)):
             members: list[int] = runs.tolist()
             chosen: IntArray = np.array(list(combinations(members, int(plus))), dtype=np.int64)
             if s == 0 and self.symmetric:
@@ -275,16 +275,16 @@ class Strata:
             (mean '+' - mean others) / sqrt(s1^2 / r1 + s2^2 / r2). 0 where all runs of each
             stratum agree to the bit; finite where they agree but for their label.
         """
-        own = [np.flatnonzero(self.index == s) for s in range(self.strata)]
+        stratum_rows = [np.flatnonzero(self.index == s) for s in range(self.strata)]
         # The first of all subtracted first, so that runs that agree give exact zeros.
-        centred = [runs[..., rows, :] - runs[..., rows[:1], :] for rows in own]
-        centred = [one - one.mean(axis=-2, keepdims=True) for one in centred]
-        size = np.sqrt(sum(np.sum(one**2, axis=-2, keepdims=True) for one in centred))
+        centred = [runs[..., rows, :] - runs[..., rows[:1], :] for rows in stratum_rows]
+        centred = [stratum - stratum.mean(axis=-2, keepdims=True) for stratum in centred]
+        size = np.sqrt(sum(np.sum(stratum**2, axis=-2, keepdims=True) for stratum in centred))
         counts = np.stack([self.plus, self.minus])
         difference = within1 = within2 = np.zeros(1)
-        for s, (rows, one) in enumerate(zip(own, centred, strict=True)):
+        for s, (rows, stratum) in enumerate(zip(stratum_rows, centred, strict=True)):
             r1, r2 = counts[:, s].tolist()
-            z = np.divide(one, size, out=np.zeros_like(one), where=size > 0)
+            z = np.divide(stratum, size, out=np.zeros_like(stratum), where=size > 0)
             # All sums from those of '+' alone: z sums to 0 in a stratum.
             plus = labels[:, rows].astype(np.float64)
             first, squares = plus @ z, plus @ z**2
@@ -306,12 +306,12 @@ class Strata:
             Shape (c,).
         """
         plus = np.arange(len(runs)) < int(self.plus.sum())
-        each = [
+        differences = [
             runs[(self.index == s) & plus].mean(axis=0)
             - runs[(self.index == s) & ~plus].mean(axis=0)
             for s in range(self.strata)
         ]
-        return (self.weights[:, None] * np.stack(each)).sum(axis=0)
+        return (self.weights[:, None] * np.stack(differences)).sum(axis=0)
 
     def residuals(self, runs: FloatArray) -> FloatArray:
         """Subtract the mean of each run's way in its stratum.
@@ -324,8 +324,8 @@ class Strata:
         """
         cell = 2 * self.index + (np.arange(len(runs)) >= int(self.plus.sum()))
         out = runs.copy()
-        for one in np.unique(cell):
-            out[cell == one] -= runs[cell == one].mean(axis=0)
+        for number in np.unique(cell):
+            out[cell == number] -= runs[cell == number].mean(axis=0)
         return out
 
     def variances(self, runs: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -235,15 +235,18 @@ def _spectra(
         DataError: If there are none.
     """
     every = [*commands.values(), *responses.values()]
-    start_s, stop_s = max(one.t_s[0] for one in every), min(one.t_s[-1] for one in every)
+    start_s, stop_s = (
+        max(channel.t_s[0] for channel in every),
+        min(channel.t_s[-1] for channel in every),
+    )
     T = design.period_s
-    step_s = max(one.period_s for one in every)
+    step_s = max(channel.period_s for channel in every)
     if stop_s - start_s + step_s < T:
         raise DataError(
             f"holds {max(stop_s - start_s, 0.0):.4g} s of steady commands and responses, less than "
             f"a period of {T:g} s"
         )
-    length = min(round(T / step_s), *(one.count for one in every))
+    length = min(round(T / step_s), *(channel.count for channel in every))
     if design.lines[-1] > HIGHEST * length:
         raise DataError(
             f"is sampled every {step_s:.3g} s, too slowly for its lines up to "
@@ -251,10 +254,10 @@ def _spectra(
         )
     end_s, periods = _steady_periods(design, [*commands.values()], (start_s, stop_s), length)
     t_s = end_s - np.arange(periods * length, 0, -1) * T / length
-    for one in every:
-        inside = one.between(t_s[0], t_s[-1])
+    for channel in every:
+        inside = channel.between(t_s[0], t_s[-1])
         if inside.count < 2 or np.diff(inside.t_s).max() > max(_LONG_GAP * T, 4 * step_s):
-            raise DataError(f"has a gap at {one.name} within its steady periods")
+            raise DataError(f"has a gap at {channel.name} within its steady periods")
 
     def spectrum(series: Series) -> ComplexArray:
         values = resampled(series, t_s).reshape(periods, length)
@@ -310,11 +313,11 @@ def find_multisine(runs: Sequence[MultisineRun | str | None]) -> MultisineRuns |
     Returns:
         None where fewer than two sessions are of one.
     """
-    why = {k: one for k, one in enumerate(runs) if isinstance(one, str)}
-    known = [(k, one) for k, one in enumerate(runs) if isinstance(one, MultisineRun)]
+    why = {k: reason for k, reason in enumerate(runs) if isinstance(reason, str)}
+    multisines = [(k, run) for k, run in enumerate(runs) if isinstance(run, MultisineRun)]
     best: list[tuple[int, MultisineRun]] = []
-    for _, model in known:
-        alike = [(k, one) for k, one in known if _alike(one, model)]
+    for _, model in multisines:
+        alike = [(k, run) for k, run in multisines if _alike(run, model)]
         best = alike if len(alike) > len(best) else best
     if len(best) < 2:
         return None
@@ -330,7 +333,7 @@ def find_multisine(runs: Sequence[MultisineRun | str | None]) -> MultisineRuns |
         chosen[k] = run
     if len(chosen) < 2:
         return None
-    for k, run in known:
+    for k, run in multisines:
         if k not in chosen and k not in why:
             differs = (
                 "names another experiment"
@@ -358,13 +361,15 @@ def _numbered(runs: Sequence[MultisineRun]) -> tuple[MultisineRun, ...]:
     if runs[0].design.realisation >= 0:
         return tuple(runs)
     first: list[MultisineRun] = []
-    found: list[MultisineRun] = []
+    numbered: list[MultisineRun] = []
     for run in runs:
-        number = next((k for k, one in enumerate(first) if _same_phases(one, run)), len(first))
+        number = next(
+            (k for k, earlier in enumerate(first) if _same_phases(earlier, run)), len(first)
+        )
         if number == len(first):
             first.append(run)
-        found.append(replace(run, design=replace(run.design, realisation=number)))
-    return tuple(found)
+        numbered.append(replace(run, design=replace(run.design, realisation=number)))
+    return tuple(numbered)
 
 
 def _same_phases(run: MultisineRun, other: MultisineRun) -> bool:

@@ -106,8 +106,8 @@ class _System:
 
     def beside(self, named: tuple[int, ...]) -> FloatArray:
         """Return columns of x and of the named modules, shape (..., n, K + q len(named))."""
-        own = self.modules[..., list(named), :]
-        return np.concatenate([self.shared, own.reshape(*own.shape[:-2], -1)], axis=-1)
+        modules = self.modules[..., list(named), :]
+        return np.concatenate([self.shared, modules.reshape(*modules.shape[:-2], -1)], axis=-1)
 
 
 def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTest:
@@ -177,11 +177,11 @@ def _linear(
     """Fit x with the named modules free, and the system there."""
     effects = np.stack(list(model.modules.values()), axis=-1)[:, joints]  # (m, r, q)
     columns = np.concatenate([effects.real, effects.imag], axis=1).transpose(1, 0, 2)
-    own = columns[:, list(named)].reshape(len(columns), -1)
-    x = _fitted(y, variance, joints, model, own)
+    free = columns[:, list(named)].reshape(len(columns), -1)
+    x = _fitted(y, variance, joints, model, free)
     # Where the shared parameters are far from the model's own, its error is noise, too.
     variance = variance + model.error_at(x) ** 2
-    x = _fitted(y, variance, joints, model, own)
+    x = _fitted(y, variance, joints, model, free)
     weight, prior = 1 / np.sqrt(variance), _root(model)
     return x, _System(
         shared=np.concatenate([weight[:, None] * parts(model.at(x)[1][:, joints]).T, prior]),
@@ -204,11 +204,11 @@ def _residual(y: ComplexArray, joints: IntArray, model: NullModel, x: FloatArray
 
 
 def _fitted(
-    y: ComplexArray, variance: FloatArray, joints: IntArray, model: NullModel, own: FloatArray
+    y: ComplexArray, variance: FloatArray, joints: IntArray, model: NullModel, columns: FloatArray
 ) -> FloatArray:
     """Fit x by Levenberg and Marquardt's method, beside the free columns of modules, (2 r, c)."""
     prior, weight, count = _root(model), 1 / np.sqrt(variance), len(model.parameters)
-    free = np.concatenate([weight[:, None] * own, np.zeros((count, own.shape[1]))])
+    free = np.concatenate([weight[:, None] * columns, np.zeros((count, columns.shape[1]))])
 
     def left(unknown: FloatArray) -> FloatArray:
         x, z = unknown[:count], unknown[count:]
@@ -219,13 +219,13 @@ def _fitted(
         design = np.concatenate([weight[:, None] * shared, prior])
         return -np.concatenate([design, free], axis=1)
 
-    start = np.zeros(count + own.shape[1])
+    start = np.zeros(count + columns.shape[1])
     from scipy.optimize import least_squares  # only for who asks for it: half a second
 
-    found = least_squares(left, start, jac=slope, method="lm", xtol=1e-12, ftol=1e-12)
-    if found.status <= 0:
+    solution = least_squares(left, start, jac=slope, method="lm", xtol=1e-12, ftol=1e-12)
+    if solution.status <= 0:
         raise DataError("no shared parameters of the null model fit this session")
-    return np.asarray(found.x[:count], dtype=np.float64)
+    return np.asarray(solution.x[:count], dtype=np.float64)
 
 
 def _draws(system: _System, dof: FloatArray, random: np.random.Generator) -> _System:
@@ -250,9 +250,9 @@ def _one_by_one(
     gain, deviation, error = _alone(system, system.beside(named))
     for j in named:
         base = system.beside(tuple(k for k in named if k != j))
-        own = _alone(_System(system.shared, system.modules[..., [j], :], system.rest), base)
-        gain[..., j] = own[0][..., 0]
-        deviation[..., j, :], error[..., j, :] = own[1][..., 0, :], own[2][..., 0, :]
+        alone = _alone(_System(system.shared, system.modules[..., [j], :], system.rest), base)
+        gain[..., j] = alone[0][..., 0]
+        deviation[..., j, :], error[..., j, :] = alone[1][..., 0, :], alone[2][..., 0, :]
     return gain, deviation, error
 
 
@@ -309,9 +309,9 @@ def analyse_with_null(
         )
     if silent := len(model.joints) - len(joints):
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
-    known: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
-    known["provenance"] = _provenance(analysis, file)
-    return ModelledAnalysis(**known, null_model=result)
+    fields: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
+    fields["provenance"] = _provenance(analysis, file)
+    return ModelledAnalysis(**fields, null_model=result)
 
 
 def _answered(
@@ -339,9 +339,9 @@ def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
         return "its joints have several frequencies, the model one"
     if gait.driven != model.joints:
         return f"it drives {', '.join(gait.driven)}, the model {', '.join(model.joints)}"
-    frequency, own = model.frequency_hz, gait.fit.frequency_hz
-    if abs(own - frequency) > SAME_FREQUENCY * frequency:
-        texts = distinct(own, frequency)
+    frequency, measured = model.frequency_hz, gait.fit.frequency_hz
+    if abs(measured - frequency) > SAME_FREQUENCY * frequency:
+        texts = distinct(measured, frequency)
         return f"its gait has {texts[0]} Hz, the model's {texts[1]} Hz"
     change = gait.fit.fundamental[: len(gait.driven)] / model.command
     off = np.abs(change * np.exp(-1j * np.angle(np.sum(change))) - 1)
@@ -407,10 +407,10 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
 
 
 def _provenance(analysis: Analysis, file: Path) -> Provenance:
-    own = analysis.provenance
+    provenance = analysis.provenance
     return dataclasses.replace(
-        own,
-        command=f"{own.command} {shlex.join(['--null', str(file)])}",
-        inputs={**own.inputs, str(file): hashlib.sha256(file.read_bytes()).hexdigest()},
-        options={**own.options, "null": str(file), "draws": DRAWS},
+        provenance,
+        command=f"{provenance.command} {shlex.join(['--null', str(file)])}",
+        inputs={**provenance.inputs, str(file): hashlib.sha256(file.read_bytes()).hexdigest()},
+        options={**provenance.options, "null": str(file), "draws": DRAWS},
     )

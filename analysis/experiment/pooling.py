@@ -65,12 +65,12 @@ def experiment_indices(
         ``boundary_share`` (H2), ``equivalence_mirror_gain`` and ``equivalence_mirror_lag``. None
         where they can't be computed.
     """
-    found: dict[str, tuple[float | None, Interval | None, float | None]] = {}
+    values: dict[str, tuple[float | None, Interval | None, float | None]] = {}
     if reversal is not None:
         module, boundary = reversal.module_share, reversal.boundary_share
         gain = max(abs(joint.log_gain_difference.value or 0.0) for joint in reversal.joints)
         lag = max(abs(joint.lag_difference_rad.value or 0.0) for joint in reversal.joints)
-        found = {
+        values = {
             "mirror_response": (reversal.statistic, None, reversal.p),
             "module_share": (module.value, module.ci95, reversal.p),
             "boundary_share": (boundary.value, boundary.ci95, None),
@@ -78,22 +78,22 @@ def experiment_indices(
             "equivalence_mirror_lag": (lag, None, reversal.equivalence_lag_p),
         }
     return {"common_response": _common_response([forward, reverse])} | {
-        name: Index(*found.get(name, (None, None, None)), unit, label)
+        name: Index(*values.get(name, (None, None, None)), unit, label)
         for name, (unit, label) in _LABELS.items()
     }
 
 
 def _common_response(ways: list[ComplexArray]) -> Index:
     """Return F of H0 over the means of each way's runs, each way about its own mean."""
-    known = [way for way in ways if len(way) >= MIN_RUNS and way.shape[1] > 1]
+    usable = [way for way in ways if len(way) >= MIN_RUNS and way.shape[1] > 1]
     ratio = p = None
-    if known:
-        values = np.concatenate([parts(one.mean(axis=0)) for one in known])
-        variance = np.concatenate([parts(one).var(axis=0, ddof=1) / len(one) for one in known])
-        dof = np.full(known[0].shape[1], min(len(one) for one in known) - 1.0)
-        found = spread(values, variance, dof, blocks=2 * len(known))
-        if found.expected != 0:
-            ratio, p = found.ratio, found.p
+    if usable:
+        values = np.concatenate([parts(way.mean(axis=0)) for way in usable])
+        variance = np.concatenate([parts(way).var(axis=0, ddof=1) / len(way) for way in usable])
+        dof = np.full(usable[0].shape[1], min(len(way) for way in usable) - 1.0)
+        test = spread(values, variance, dof, blocks=2 * len(usable))
+        if test.expected != 0:
+            ratio, p = test.ratio, test.p
     label = "F of H0: all joints have the same gain and delay, noise from run to run"
     return Index(ratio, None, p, "1", label)
 
@@ -107,14 +107,14 @@ class PooledResponse:
         runs: How many runs, r.
         response: Mean ln H with the variances of the mean; degrees of freedom r - 1, of one run
             its own.
-        each: ln H of each run, the phases of a joint within pi of their mean, shape (r, m).
+        log_response: ln H of each run, the phases of a joint within pi of their mean, shape (r, m).
         covariance: Of the mean's parts, ln|H| of all joints, then arg H [rad], shape (2 m, 2 m).
     """
 
     names: tuple[str, ...]
     runs: int
     response: Response
-    each: ComplexArray
+    log_response: ComplexArray
     covariance: FloatArray
 
 
@@ -140,22 +140,22 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
         np.isfinite(run.ratio) & np.isfinite(run.log_gain_variance) & np.isfinite(run.lag_variance)
         for run in runs
     ]
-    known = np.flatnonzero(np.all(sound, axis=0))
-    chosen = [run.select(known.tolist()) for run in runs]
-    ratio = np.stack([one.ratio for one in chosen])
+    shared = np.flatnonzero(np.all(sound, axis=0))
+    chosen = [run.select(shared.tolist()) for run in runs]
+    ratio = np.stack([run.ratio for run in chosen])
     turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
     phase = turn + np.angle(ratio * np.exp(-1j * turn))  # of a joint within pi of their mean
-    each = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
-    mean = each.mean(axis=0)
-    count, m = len(runs), len(known)
+    log_response = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
+    mean = log_response.mean(axis=0)
+    count, m = len(runs), len(shared)
     within = np.concatenate(
         [
-            np.mean([one.log_gain_variance for one in chosen], axis=0),
-            np.mean([one.lag_variance for one in chosen], axis=0),
+            np.mean([run.log_gain_variance for run in chosen], axis=0),
+            np.mean([run.lag_variance for run in chosen], axis=0),
         ]
     )
     if count > 1:
-        centred = parts(each) - parts(each).mean(axis=0)
+        centred = parts(log_response) - parts(log_response).mean(axis=0)
         scatter = centred.T @ centred / (count - 1)
         dof = np.full(m, count - 1.0)
     else:
@@ -166,7 +166,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
     covariance = (scatter + np.diag(raised)) / count
     variance = np.diag(covariance)
     return PooledResponse(
-        names=tuple(names[k] for k in known.tolist()),
+        names=tuple(names[k] for k in shared.tolist()),
         runs=count,
         response=Response(
             ratio=frozen(np.exp(mean)),
@@ -174,7 +174,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
             lag_variance=frozen(variance[m:].copy()),
             dof=frozen(dof),
         ),
-        each=frozen(each),
+        log_response=frozen(log_response),
         covariance=frozen(covariance),
     )
 
@@ -193,18 +193,18 @@ def pooled_answer(
     """
     faulty: dict[str, NotFollowing] = {}
     for session in sessions:
-        for each in session.answer.not_following:
-            faulty.setdefault(each.joint, each)
+        for fault in session.answer.not_following:
+            faulty.setdefault(fault.joint, fault)
     commanded = [joint.name for joint in sessions[0].joints if joint.command_amplitude_rad]
-    gains = _scatter(pooled.each.real, pooled.response.log_gain_variance)
-    lags = _scatter(pooled.each.imag, pooled.response.lag_variance)
+    gains = _scatter(pooled.log_response.real, pooled.response.log_gain_variance)
+    lags = _scatter(pooled.log_response.imag, pooled.response.lag_variance)
     chains: list[Chain] = []
     for plane, names in by_plane(robot, commanded).items():
-        own = [name for name in names if name in pooled.names and name not in faulty]
-        index = [pooled.names.index(name) for name in own]
+        sound = [name for name in names if name in pooled.names and name not in faulty]
+        index = [pooled.names.index(name) for name in sound]
         scatter = (gains.select(index), lags.select(index))
         response = pooled.response.select(index)
-        chains.append(Chain(plane, 0, tuple(names), tuple(own), response, scatter=scatter))
+        chains.append(Chain(plane, 0, tuple(names), tuple(sound), response, scatter=scatter))
     first = sessions[0]
     order: Mapping[str, int] = {joint.name: k for k, joint in enumerate(first.joints)}
     return compose(
@@ -212,7 +212,7 @@ def pooled_answer(
             gait=first.gait,
             joints=first.joints,
             commanded=tuple(commanded),
-            not_following=tuple(sorted(faulty.values(), key=lambda each: order[each.joint])),
+            not_following=tuple(sorted(faulty.values(), key=lambda fault: order[fault.joint])),
             findings=examine(chains),
             judgement=_first_of_each_joint([session.answer for session in sessions]),
             warnings=first.warnings,
@@ -225,7 +225,11 @@ def _first_of_each_joint(answers: Sequence[Answer]) -> Judgement:
     changes = {change.joint: change for answer in answers[::-1] for change in answer.changes}
     extra = {motion.joint: motion for answer in answers[::-1] for motion in answer.extra}
     rests = {rest.joint: rest for answer in answers[::-1] for rest in answer.rests}
-    apart = {(each.joint, each.quantity): each for answer in answers[::-1] for each in answer.apart}
+    apart = {
+        (deviation.joint, deviation.quantity): deviation
+        for answer in answers[::-1]
+        for deviation in answer.apart
+    }
     return Judgement(
         changes=tuple(changes.values()),
         extra=tuple(extra.values()),

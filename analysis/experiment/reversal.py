@@ -113,8 +113,8 @@ def floor_lean(lean_rad: FloatArray, heading_rad: FloatArray) -> Estimate:
         differ by half a turn the sensor's own offset is taken out. Empty with fewer than three
         runs.
     """
-    known = np.isfinite(lean_rad)
-    lean, heading = lean_rad[known], heading_rad[known]
+    recorded = np.isfinite(lean_rad)
+    lean, heading = lean_rad[recorded], heading_rad[recorded]
     along = np.ones_like(lean)
     columns = [along]
     if np.isfinite(heading).all() and heading.size:
@@ -234,7 +234,7 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
     random = np.random.default_rng(1)
     noise = np.stack([_noise(forward), _noise(mirrored)])
     module, boundary = _variances(np.stack([forward.mean(axis=0), mirrored.mean(axis=0)]), noise)
-    drawn = np.stack([_resampled(one, random) for one in (forward, mirrored)])
+    drawn = np.stack([_resampled(runs, random) for runs in (forward, mirrored)])
     modules, boundaries = _variances(drawn, 2 * noise)
     whole, wholes = module + boundary, modules + boundaries
     share = rest = Estimate()
@@ -307,12 +307,16 @@ def reversal_of(
     Raises:
         UsageError: If a way has fewer than two runs.
     """
-    known = headings or (np.full(len(forward), np.nan), np.full(len(reverse), np.nan))
-    strata = heading_strata(*known)
+    recorded = headings or (np.full(len(forward), np.nan), np.full(len(reverse), np.nan))
+    strata = heading_strata(*recorded)
     test = mirror_test(forward, reverse, strata)
     half = test.critical * test.error
     bounds = (np.abs([test.difference.real, test.difference.imag]) + half).max(axis=1)
-    kind = Headings.UNBALANCED if all(np.isfinite(one).all() for one in known) else Headings.UNKNOWN
+    kind = (
+        Headings.UNBALANCED
+        if all(np.isfinite(heading).all() for heading in recorded)
+        else Headings.UNKNOWN
+    )
     if strata is not None:
         kind = Headings.BALANCED
     return Reversal(
@@ -365,15 +369,17 @@ def ordered_pairs(names: Sequence[str], test: MirrorTest) -> tuple[OrderedPair, 
         by = ("gain", "lag")[part]
         pair = OrderedPair(names[k], names[m - 1 - k], by, gain, lag, float(test.pair_p[i]))
         pairs.append((abs(test.contrast[i]), pair))
-    pairs.sort(key=lambda each: each[0], reverse=True)
+    pairs.sort(key=lambda ranked: ranked[0], reverse=True)
     return tuple(pair for _, pair in pairs)
 
 
 def _joints(names: Sequence[str], test: MirrorTest) -> tuple[MirrorJoint, ...]:
-    own = test.joint_p
+    joint_p = test.joint_p
     half = test.critical * test.error
     return tuple(
-        MirrorJoint(name, names[-1 - i], *_estimates(test.difference[i], half[:, i]), float(own[i]))
+        MirrorJoint(
+            name, names[-1 - i], *_estimates(test.difference[i], half[:, i]), float(joint_p[i])
+        )
         for i, name in enumerate(names)
     )
 

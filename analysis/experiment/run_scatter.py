@@ -70,9 +70,9 @@ class RunErrors:
         m = unit.shape[1] // 2
         more = self.dof / max(self.dof - (len(self.draws) - self.dof), 1)
         same = np.tile(np.eye(m, dtype=bool), (2, 2))
-        found = np.clip((unit.T @ unit) * np.where(same, 1.0, more), -1.0, 1.0)
-        np.fill_diagonal(found, 1.0)
-        return found
+        correlation = np.clip((unit.T @ unit) * np.where(same, 1.0, more), -1.0, 1.0)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
 
 
 def run_errors(
@@ -118,7 +118,7 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
     So they add nothing to the squares about that mean, and its joint has a degree of freedom less.
     """
     m = values.shape[1] // 2
-    found = values.copy()
+    adjusted = values.copy()
     for kind in Kind:
         pairs = sides(kicks, kind)
         if len(pairs) < 2:
@@ -128,10 +128,10 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
         ]
         middle = np.array([(high + low) / 2 for high, low in means])
         for k, (joint, (up, down)) in enumerate(pairs.items()):
-            own = [joint, m + joint]
-            others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
-            found[np.ix_(up + down, own)] += others - middle[k, own]
-    return found
+            columns = [joint, m + joint]
+            others = np.delete(middle[:, columns], k, axis=0).mean(axis=0)
+            adjusted[np.ix_(up + down, columns)] += others - middle[k, columns]
+    return adjusted
 
 
 def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:
@@ -147,7 +147,7 @@ def _foreseen(
     kicks: Sequence[Kick | None], m: int, derivatives: tuple[ComplexArray, ComplexArray | None]
 ) -> ComplexArray:
     """Return the response of a linear chain with these derivatives, shape (r, m)."""
-    found = np.zeros((len(kicks), m), dtype=np.complex128)
+    foreseen = np.zeros((len(kicks), m), dtype=np.complex128)
     of_phase, of_amplitude = derivatives
     for k, kick in enumerate(kicks):
         if kick is None:
@@ -155,8 +155,8 @@ def _foreseen(
         phase = kick.kind is Kind.PHASE
         L = of_phase if phase else of_amplitude
         if L is not None:
-            found[k] = np.log1p(L[:, kick.joint] * np.expm1(kick.size * (1j if phase else 1.0)))
-    return found
+            foreseen[k] = np.log1p(L[:, kick.joint] * np.expm1(kick.size * (1j if phase else 1.0)))
+    return foreseen
 
 
 def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArray]:
@@ -178,7 +178,7 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
 
 def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     """Compare kicks up and down together with the mean of all of them, for each kind."""
-    found: list[FloatArray] = []
+    contrasts: list[FloatArray] = []
     for kind in Kind:
         pairs: list[FloatArray] = []
         for up, down in sides(kicks, kind).values():
@@ -187,8 +187,8 @@ def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
             row[down] = 0.5 / len(down)
             pairs.append(row)
         mean = np.mean(pairs, axis=0) if pairs else np.zeros(len(kicks))
-        found += [row - mean for row in pairs[1:]]
-    return found
+        contrasts += [row - mean for row in pairs[1:]]
+    return contrasts
 
 
 def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int], list[int]]]:
@@ -209,7 +209,7 @@ def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int]
 
 
 def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:
-    return float(np.mean([one.size for k in chosen if (one := kicks[k]) is not None]))
+    return float(np.mean([kick.size for k in chosen if (kick := kicks[k]) is not None]))
 
 
 def _orthonormal(rows: Sequence[FloatArray], count: int) -> FloatArray:

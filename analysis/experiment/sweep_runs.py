@@ -104,9 +104,11 @@ def read_signals(session: SessionView, options: Options) -> Signals:
     half_s = stretch.duration_s / 2
 
     def part(signals: Mapping[str, Signal]) -> dict[str, Series]:
-        known = [(name, signals[name]) for name in columns.names if name in signals]
-        cleaned = {name: clean(name, one.t_ns, one.values, origin_ns) for name, one in known}
-        return {name: one.between(-half_s, half_s) for name, one in cleaned.items()}
+        recorded = [(name, signals[name]) for name in columns.names if name in signals]
+        cleaned = {
+            name: clean(name, signal.t_ns, signal.values, origin_ns) for name, signal in recorded
+        }
+        return {name: series.between(-half_s, half_s) for name, series in cleaned.items()}
 
     return part(columns.command), part(columns.position), part(columns.effort)
 
@@ -155,9 +157,9 @@ def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
             for k, session in enumerate(sessions)
             if session is not None and _alike(session, model)
         ]
-        found = _sweep(index, [one for k in index if (one := sessions[k]) is not None])
-        if found is not None and (best is None or _rank(found) > _rank(best)):
-            best = found
+        sweep = _sweep(index, [tones for k in index if (tones := sessions[k]) is not None])
+        if sweep is not None and (best is None or _rank(sweep) > _rank(best)):
+            best = sweep
     return best
 
 
@@ -183,7 +185,7 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
     # Fewer runs than joints: part of a sweep if they are all at right angles to each other.
     unit = C / np.linalg.norm(C, axis=0)
     gram = [np.abs(unit[:, :, k].conj().T @ unit[:, :, k] - np.eye(r)) for k in range(lines)]
-    apart = [k for k, one in enumerate(gram) if one.max() < _ORTHOGONAL]
+    apart = [k for k, deviation in enumerate(gram) if deviation.max() < _ORTHOGONAL]
     if not apart or r < max(3, m / 2):
         return None
     return Sweep(tuple(index), runs[0].names, tuple(apart), lines, lacking=m - r)
@@ -253,13 +255,13 @@ def sweep_data(
         commanded_series, series = (
             [kind[name] for name in sweep.names] for kind in (command, position)
         )
-        own = _beside_lines(sweep, tones.omega, series)
-        lines = own if not omega else lines
+        beside = _beside_lines(sweep, tones.omega, series)
+        lines = beside if not omega else lines
         omega.append(tones.omega)
         commands.append(fit_tones(commanded_series, tones.omega, np.zeros(0)).amplitude)
-        responses.append(fit_tones(series, tones.omega, own))
+        responses.append(fit_tones(series, tones.omega, beside))
         if all(name in effort for name in sweep.names):
-            torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, own))
+            torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, beside))
         periods_s.append(max(signal.period_s for signal in commanded_series))
         drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if twin is None else twin.contact for twin in twins]
@@ -267,7 +269,7 @@ def sweep_data(
     whole = len(torques) == len(responses)
     free = range(omega[0].size, omega[0].size + lines.size)
     return SweepData(
-        omega=np.mean([one[at] for one in omega], axis=0),
+        omega=np.mean([run[at] for run in omega], axis=0),
         command=np.stack([command[:, at] for command in commands], axis=-1).swapaxes(0, 1),
         response=_phasors(responses, at),
         torque=_phasors(torques, at) if whole else None,

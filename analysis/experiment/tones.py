@@ -141,8 +141,8 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
         sum of a few tones, or all tones are harmonics of the lowest: that is a gait.
     """
     moving = [command for command in commands if command.count > 64 and np.ptp(command.values) > 0]
-    moving.sort(key=lambda one: float(np.var(one.values)), reverse=True)
-    scouts = [_cut(one) for one in moving[:_SCOUTS]]
+    moving.sort(key=lambda command: float(np.var(command.values)), reverse=True)
+    scouts = [_cut(command) for command in moving[:_SCOUTS]]
     if not scouts:
         return None
     total = sum(float(np.sum(scout.values**2)) for scout in scouts)
@@ -160,7 +160,7 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
             break
         omega, residual = grown, left
     omega = np.sort(omega)
-    explained = 1 - sum(float(np.sum(one**2)) for one in residual) / total
+    explained = 1 - sum(float(np.sum(values**2)) for values in residual) / total
     if omega.size < 2 or explained < EXPLAINED:
         return None
     multiples: FloatArray = omega / omega[0]
@@ -194,9 +194,9 @@ def _span(scouts: Sequence[Series]) -> float:
 
 def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | None:
     """Return the highest line of the residual [rad/s]; on an even grid, as a starting point."""
-    period = max(one.period_s for one in scouts)
-    start = max(float(one.t_s[0]) for one in scouts)
-    stop = min(float(one.t_s[-1]) for one in scouts)
+    period = max(scout.period_s for scout in scouts)
+    start = max(float(scout.t_s[0]) for scout in scouts)
+    stop = min(float(scout.t_s[-1]) for scout in scouts)
     count = int((stop - start) / period) + 1 if stop > start else 0
     if not 64 <= count <= _MOST_GAPS * _MOST_SAMPLES:
         return None
@@ -300,8 +300,10 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         of_part = 0.5 * (spread[1::2] + spread[2::2])
         for tone in range(tones):
             level, bins = _level(t_s, residual, float(omega[tone]), rows, inverse)
-            own = [tone, *(tones + np.flatnonzero(nearest == tone)).tolist()]
-            variance[np.ix_(members, own)] = np.maximum(level, floor)[:, None] * of_part[None, own]
+            columns = [tone, *(tones + np.flatnonzero(nearest == tone)).tolist()]
+            variance[np.ix_(members, columns)] = (
+                np.maximum(level, floor)[:, None] * of_part[None, columns]
+            )
             dof[members, tone] = 2.0 * bins
     dof[:, tones:] = dof[:, :tones].min(axis=1, keepdims=True)
     return ToneFit(amplitude, variance, dof)

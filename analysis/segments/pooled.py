@@ -89,6 +89,6 @@ def _mixed(scatters: Sequence[Scatter], weights: FloatArray) -> Scatter:
     squared = weights**2
     return Scatter(
         np.concatenate(columns, axis=1),
-        squared @ np.stack([scatter.own for scatter in scatters]),
+        squared @ np.stack([scatter.unshared for scatter in scatters]),
         weights @ np.stack([scatter.turn for scatter in scatters]),
     )

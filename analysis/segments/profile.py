@@ -65,12 +65,12 @@ class Scatter:
     Attributes:
         columns: Realisations whose mean square is the variance of the estimates, of any weighted
             sum of joints too, shape (m, K); K is the number of degrees of freedom.
-        own: Variance that is not in the columns and that no two joints share, shape (m,).
+        unshared: Variance that is not in the columns and that no two joints share, shape (m,).
         turn: Error that all joints have in common up to this factor, shape (m,).
     """
 
     columns: FloatArray
-    own: FloatArray
+    unshared: FloatArray
     turn: FloatArray
 
     def variance(self, weights: FloatArray) -> FloatArray:
@@ -82,13 +82,13 @@ class Scatter:
         Returns:
             Shape (c,).
         """
-        found = np.mean((weights @ self.columns) ** 2, axis=-1)
-        return found + weights**2 @ self.own + (weights @ self.turn) ** 2
+        shared = np.mean((weights @ self.columns) ** 2, axis=-1)
+        return shared + weights**2 @ self.unshared + (weights @ self.turn) ** 2
 
     def select(self, chosen: Sequence[int]) -> Scatter:
         """Some of the joints."""
         index = np.asarray(chosen, dtype=np.int64)
-        return Scatter(self.columns[index], self.own[index], self.turn[index])
+        return Scatter(self.columns[index], self.unshared[index], self.turn[index])
 
 
 def scatter_of(errors: ResponseErrors) -> tuple[Scatter, Scatter]:
@@ -146,13 +146,13 @@ class _Normals(NamedTuple):
     Attributes:
         shared: Of the columns, shape (n, d, n + 1) each.
         single: Of each joint alone, shape (m, d, n + 1) each.
-        own: Of each joint's rounding, shape (m, d) each.
+        rounding: Of each joint's rounding, shape (m, d) each.
         turn: Of the common turn, shape (1, d) each.
     """
 
     shared: Iterable[FloatArray]
     single: Iterable[FloatArray]
-    own: Iterable[FloatArray]
+    rounding: Iterable[FloatArray]
     turn: Iterable[FloatArray]
 
 
@@ -196,10 +196,10 @@ def _largest(member: Member, normals: _Normals) -> FloatArray:
     shared, single = np.sqrt((1 - shrink) / count), np.sqrt(shrink)
     blocks = _product(shared * weights @ columns, normals.shared)
     blocks += _product(single * weights * sigma, normals.single)
-    error = blocks[..., -1] + _product(weights * np.sqrt(scatter.own), normals.own)
+    error = blocks[..., -1] + _product(weights * np.sqrt(scatter.unshared), normals.rounding)
     error += _product((weights @ scatter.turn)[:, np.newaxis], normals.turn)
     variance = np.mean(blocks[..., :-1] ** 2, axis=-1)
-    variance += (weights**2 @ scatter.own + (weights @ scatter.turn) ** 2)[:, np.newaxis]
+    variance += (weights**2 @ scatter.unshared + (weights @ scatter.turn) ** 2)[:, np.newaxis]
     return np.max(np.abs(error) / np.sqrt(np.maximum(variance, TINY)), axis=0)
 
 
@@ -244,8 +244,8 @@ class Profile:
         Weights that follow the estimated variances closely would favour those that happen to be
         estimated too small, and make intervals too narrow.
         """
-        own = self.scatter.variance(np.eye(self.values.size))
-        return 1 / np.maximum(own, max(NOISIER * float(np.median(own)), TINY))
+        variance = self.scatter.variance(np.eye(self.values.size))
+        return 1 / np.maximum(variance, max(NOISIER * float(np.median(variance)), TINY))
 
 
 @dataclass(frozen=True)
@@ -289,11 +289,11 @@ def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatA
         Kind and weights, shape (m,); those for which there are joints enough.
     """
     size = profile.values.size
-    found: list[tuple[str, FloatArray]] = []
+    weights: list[tuple[str, FloatArray]] = []
     x = profile.along
     index = np.flatnonzero(active)
     if index.size <= 2:
-        return found
+        return weights
     if profile.count >= ENDS + MIDDLE and index.size >= ENDS + 2:
         distance = np.abs(x)
         outer = active & np.isclose(distance, 1)
@@ -301,15 +301,15 @@ def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatA
         inner = active & (distance < limit) & ~np.isclose(distance, limit)
         if np.count_nonzero(outer) == ENDS and inner.any():
             row = outer / np.count_nonzero(outer) - inner / np.count_nonzero(inner)
-            found.append(("ends", row.astype(np.float64)))
+            weights.append(("ends", row.astype(np.float64)))
     weight = np.where(active, profile.precision, 0.0)
     for kind, column, span in (("trend", x, 2.0), ("mirror", np.abs(x), 1 / 2)):
         basis = [np.ones(size)] if kind == "trend" else [np.ones(size), x]
         if index.size > len(basis) + 1:
             row = coefficient_weights(column, basis, weight)
             if row is not None:
-                found.append((kind, span * row))
-    return found
+                weights.append((kind, span * row))
+    return weights
 
 
 def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
@@ -321,13 +321,13 @@ def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
     Returns:
         Each shape's contrast, then the largest studentised deviation of one joint.
     """
-    found: list[Contrast] = []
+    shapes: list[Contrast] = []
     for kind, row in shape_weights(profile, active):
         variance = float(profile.scatter.variance(row[None, :])[0])
         value = float(row @ profile.values)
         # A contrast c^T y of unit weights explains (c^T y)^2 / c^T c of the sum of squares.
         spread = abs(value) / float(np.sqrt(row @ row * np.count_nonzero(active)))
-        found.append(Contrast(kind, value, math.sqrt(variance), spread))
+        shapes.append(Contrast(kind, value, math.sqrt(variance), spread))
     if np.count_nonzero(active) > 1:
         rows = deviation_weights(profile, active, [])
         index = np.flatnonzero(active)
@@ -335,8 +335,8 @@ def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
         error = np.sqrt(profile.scatter.variance(rows[index]))
         k = int(np.argmax(np.abs(value) / np.maximum(error, TINY)))
         spread = abs(float(value[k])) / math.sqrt(index.size)
-        found.append(Contrast("each", float(value[k]), float(error[k]), spread, int(index[k])))
-    return found
+        shapes.append(Contrast("each", float(value[k]), float(error[k]), spread, int(index[k])))
+    return shapes
 
 
 def everyone(profile: Profile) -> BoolArray:

@@ -54,7 +54,11 @@ def test_the_covariance_is_that_of_the_mean():
             for _ in range(4)
         ]
         pooled = pool_runs("abcd", runs)
-        means.append(np.concatenate([pooled.each.mean(axis=0).real, pooled.each.mean(axis=0).imag]))
+        means.append(
+            np.concatenate(
+                [pooled.log_response.mean(axis=0).real, pooled.log_response.mean(axis=0).imag]
+            )
+        )
         covariances.append(pooled.covariance)
     foreign = np.cov(np.array(means).T)
     np.testing.assert_allclose(np.mean(covariances, axis=0), foreign, atol=0.2 * foreign.max())
