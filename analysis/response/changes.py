@@ -77,8 +77,8 @@ class ResponseChanges:
     """How the response of a group changes over its window.
 
     Attributes:
-        found: The model of gains and lags, relative to ``reference``.
-        reference: What ``found`` is relative to, shape (m,).
+        slow: The model of gains and lags, relative to ``reference``.
+        reference: What ``slow`` is relative to, shape (m,).
         excess: Chance that noise within the cycles makes the scatter between them.
         period_s: Length of a cycle [s].
         cycles: How many cycles there are.
@@ -88,7 +88,7 @@ class ResponseChanges:
             stay.
     """
 
-    found: SlowChanges
+    slow: SlowChanges
     reference: ComplexArray
     excess: float
     period_s: float
@@ -99,12 +99,12 @@ class ResponseChanges:
     @property
     def trend(self) -> Trend:
         """What of the trend is large enough to count."""
-        return self.found.trend if self.largest > DRIFT_PER_CYCLE else Trend.STEADY
+        return self.slow.trend if self.largest > DRIFT_PER_CYCLE else Trend.STEADY
 
     @property
     def uncertain(self) -> bool:
         """Whether the variation shows too few independent cycles for its interval to hold."""
-        few = self.found.effective < LEAST_EFFECTIVE or self.cycles < LEAST_CYCLES
+        few = self.slow.effective < LEAST_EFFECTIVE or self.cycles < LEAST_CYCLES
         return self.varies and few
 
     @property
@@ -116,7 +116,7 @@ class ResponseChanges:
         """Return :attr:`.SlowChanges.change` of log gain and of lag [rad] of one joint."""
         size = float(np.abs(self._level[joint]))
         gain_half, lag_half = (
-            self.found.change.half.reshape(2, self.reference.size)[:, joint] / size
+            self.slow.change.half.reshape(2, self.reference.size)[:, joint] / size
         ).tolist()
         change = complex(self.per_joint[joint])
         return (
@@ -126,7 +126,7 @@ class ResponseChanges:
 
     @property
     def _level(self) -> ComplexArray:
-        gain, phase = self.found.level.value.reshape(2, self.reference.size)
+        gain, phase = self.slow.level.value.reshape(2, self.reference.size)
         return gain + 1j * phase
 
     @property
@@ -134,21 +134,21 @@ class ResponseChanges:
         """Time constant [s]; empty without a transient that counts."""
         if self.trend is not Trend.SETTLING:
             return Estimate()
-        tau, low, high = (self.period_s * one for one in self.found.tau)
+        tau, low, high = (self.period_s * cycles for cycles in self.slow.tau)
         return Estimate(tau, (low, high))
 
     @property
     def per_joint(self) -> ComplexArray:
         """:attr:`.SlowChanges.change` of ln H, shape (m,)."""
-        gain, phase = self.found.change.value.reshape(2, self.reference.size)
+        gain, phase = self.slow.change.value.reshape(2, self.reference.size)
         return np.asarray((gain + 1j * phase) / self._level)
 
     @property
     def largest(self) -> float:
         """Largest change of ln H per cycle, mean over the window."""
         size = float(np.max(np.abs(self.per_joint), initial=0.0))
-        settling = self.found.trend is Trend.SETTLING
-        return size * min(self.found.tau[0] / self.cycles, 1.0) if settling else size
+        settling = self.slow.trend is Trend.SETTLING
+        return size * min(self.slow.tau[0] / self.cycles, 1.0) if settling else size
 
 
 def response_changes(
@@ -175,15 +175,15 @@ def response_changes(
         return None
     size = np.mean(np.abs(cycles.command), axis=0)
     noise = CycleNoise(np.tile(cycles.noise, 2), _SPREAD / cycles.number.size, size.mean() / size)
-    found = slow_changes(series, cycles.number, noise)
-    scatter = np.mean(found.residuals**2, axis=1) - noise.variance
+    changes = slow_changes(series, cycles.number, noise)
+    scatter = np.mean(changes.residuals**2, axis=1) - noise.variance
     return ResponseChanges(
-        found,
+        changes,
         reference,
-        found.excess,
+        changes.excess,
         2 * np.pi / fit.omega,
         cycles.number.size,
-        np.sqrt(np.maximum(scatter, 0.0)).reshape(2, reference.size) * (found.excess < EXCESS),
+        np.sqrt(np.maximum(scatter, 0.0)).reshape(2, reference.size) * (changes.excess < EXCESS),
         _amplitude_drift(cycles),
     )
 
@@ -194,34 +194,34 @@ def with_changes(response: Response, changes: ResponseChanges) -> Response:
     Where neither the response nor the gait changes, the values stay as they are, and the variances
     are raised where cycles vary by more than the noise beside the gait frequency shows.
     """
-    found = changes.found
-    moving = found.trend is not Trend.STEADY or changes.amplitude_drift is not None
+    slow = changes.slow
+    moving = slow.trend is not Trend.STEADY or changes.amplitude_drift is not None
     if not moving and changes.excess > _CLEAR_EXCESS:
         return response
     shape = (2, changes.reference.size)
-    level = found.level.value.reshape(shape)
+    level = slow.level.value.reshape(shape)
     size = np.hypot(*level)
     relative = level[0] + 1j * level[1]
-    factor = t_factor(found.dof)
+    factor = t_factor(slow.dof)
     # Turned into the direction of the level, whose angle is small.
-    own = (found.level.half.reshape(shape) / size / factor) ** 2
-    dof = np.full(size.size, found.dof)
+    variance = (slow.level.half.reshape(shape) / size / factor) ** 2
+    dof = np.full(size.size, slow.dof)
     if not moving:
-        known = np.stack([response.log_gain_variance, response.lag_variance])
-        before = known * (np.array([t_factor(each) for each in response.dof]) / factor) ** 2
-        own = np.maximum(own, before) if found.alike else own
+        within = np.stack([response.log_gain_variance, response.lag_variance])
+        before = within * (np.array([t_factor(freedom) for freedom in response.dof]) / factor) ** 2
+        variance = np.maximum(variance, before) if slow.alike else variance
         relative = response.ratio / changes.reference
     if response.errors is not None and response.errors.steps is not None:
         # Rounding repeats with the samples' phases: it isn't what cycles vary by.
-        own = np.maximum(own, response.errors.steps.T)
-    half = found.residuals.reshape(*shape, found.residuals.shape[1])
-    bins = np.sqrt(found.share[0]) * half[0] + 1j * np.sqrt(found.share[1]) * half[1]
+        variance = np.maximum(variance, response.errors.steps.T)
+    half = slow.residuals.reshape(*shape, slow.residuals.shape[1])
+    bins = np.sqrt(slow.share[0]) * half[0] + 1j * np.sqrt(slow.share[1]) * half[1]
     circular = np.mean(np.abs(bins) ** 2, axis=1) / 2
     rounding = np.zeros((size.size, 2, 2))
     for part in (0, 1):
-        rounding[:, part, part] = np.maximum(own[part] - circular, 0.0)
+        rounding[:, part, part] = np.maximum(variance[part] - circular, 0.0)
     errors = ResponseErrors(bins, rounding, np.zeros(size.size))
-    return Response(changes.reference * relative, own[0], own[1], dof, errors)
+    return Response(changes.reference * relative, variance[0], variance[1], dof, errors)
 
 
 def _cycles(
@@ -229,8 +229,8 @@ def _cycles(
 ) -> Cycles | None:
     every = (*commands, *responses)
     turn_s = 2 * np.pi / fit.omega
-    stop = min(float(one.t_s[-1] + one.period_s) for one in every)
-    start = max(float(one.t_s[0]) for one in every)
+    stop = min(float(channel.t_s[-1] + channel.period_s) for channel in every)
+    start = max(float(channel.t_s[0]) for channel in every)
     count = int((stop - start) / turn_s + 0.01)
     if count < MIN_CYCLES:
         return None
@@ -244,13 +244,13 @@ def _cycles(
     if not fit.amplitudes[at, 0].all():
         return None
     for block in _blocks(every):
-        t_s, own = every[block[0]].t_s, at[block]
-        amplitude = fit.amplitudes[own, :1]
-        rest = np.stack([every[k].values for k in block]) - fit.predict(own, t_s)
+        t_s, members = every[block[0]].t_s, at[block]
+        amplitude = fit.amplitudes[members, :1]
+        rest = np.stack([every[k].values for k in block]) - fit.predict(members, t_s)
         starts = starts_of(t_s, edges - 1e-6 * turn_s)
-        found = amplitudes(t_s, rest, starts, fit.omega)
-        whole[block] = _without_image(1 + found / amplitude, amplitude, edges, fit.omega)
-        noise[block] = _noise_within(every[block[0]], rest, starts, fit.omega, found)
+        amplitude_change = amplitudes(t_s, rest, starts, fit.omega)
+        whole[block] = _without_image(1 + amplitude_change / amplitude, amplitude, edges, fit.omega)
+        noise[block] = _noise_within(every[block[0]], rest, starts, fit.omega, amplitude_change)
     noise /= np.abs(fit.amplitudes[at, 0]) ** 2
     whole = whole.reshape(2, len(commands), count)
     usable: BoolArray = np.all(np.isfinite(whole), axis=(0, 1)).reshape(count)
@@ -311,8 +311,8 @@ def _noise_within(
     wave: ComplexArray = cosine + 1j * sine
     turn = wave * wave
     filled = np.diff(starts)
-    known: ComplexArray = np.where(np.isfinite(amplitude), amplitude, 0.0).astype(np.complex128)
-    rest: FloatArray = values[:, inside] - (np.repeat(known, filled, axis=1) * turn).real
+    finite: ComplexArray = np.where(np.isfinite(amplitude), amplitude, 0.0).astype(np.complex128)
+    rest: FloatArray = values[:, inside] - (np.repeat(finite, filled, axis=1) * turn).real
     starts = starts - starts[0]
     rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled, axis=1)
     usable = filled > 0
@@ -340,7 +340,7 @@ def _kept(beside: float) -> float:
     return 1.0 - float(np.sum(np.abs(taken) ** 2)) / 512
 
 
-_KEPT = tuple(_kept(one) for one in _BESIDE)
+_KEPT = tuple(_kept(offset) for offset in _BESIDE)
 
 
 def _amplitude_drift(cycles: Cycles) -> Estimate | None:
@@ -405,10 +405,10 @@ def moving_pace(
     Returns:
         None where the frequency stays.
     """
-    own = series[:commands]
+    driving = series[:commands]
     turn_s = 2 * np.pi / fit.omega
-    start = max(float(one.t_s[0]) for one in own)
-    stop = min(float(one.t_s[-1]) for one in own)
+    start = max(float(command.t_s[0]) for command in driving)
+    stop = min(float(command.t_s[-1]) for command in driving)
     whole = int((stop - start) / turn_s + 0.01)
     if whole < MIN_CYCLES:
         return None
@@ -416,14 +416,14 @@ def moving_pace(
     edges = start + turn_s * several * np.arange(whole // several + 1.0)
     phases: list[FloatArray] = []
     weights: list[float] = []
-    for block in _blocks(own):
-        t_s, amplitude = own[block[0]].t_s, fit.amplitudes[block, :1]
-        rest = np.stack([own[k].values for k in block]) - fit.predict(np.array(block), t_s)
-        found = 1 + amplitudes(t_s, rest, starts_of(t_s, edges), fit.omega) / amplitude
-        found = _without_image(found, amplitude, edges, fit.omega)
-        known = np.isfinite(found).all(axis=1)
-        phases.extend(np.unwrap(np.angle(found[known])))
-        weights.extend((fit.weight[block] * np.abs(amplitude[:, 0]) ** 2)[known].tolist())
+    for block in _blocks(driving):
+        t_s, amplitude = driving[block[0]].t_s, fit.amplitudes[block, :1]
+        rest = np.stack([driving[k].values for k in block]) - fit.predict(np.array(block), t_s)
+        relative = 1 + amplitudes(t_s, rest, starts_of(t_s, edges), fit.omega) / amplitude
+        relative = _without_image(relative, amplitude, edges, fit.omega)
+        finite = np.isfinite(relative).all(axis=1)
+        phases.extend(np.unwrap(np.angle(relative[finite])))
+        weights.extend((fit.weight[block] * np.abs(amplitude[:, 0]) ** 2)[finite].tolist())
     if not phases:
         return None
     middle: FloatArray = (edges[:-1] + edges[1:]) / 2
@@ -439,13 +439,13 @@ def moving_pace(
     bend = (curve - line) / fit.omega
     moved: dict[int, FloatArray] = {}
     result: list[Series] = []
-    for one in series:
-        if id(one.t_s) not in moved:
-            t_s = one.t_s + bend((one.t_s - centre) / scale)
+    for channel in series:
+        if id(channel.t_s) not in moved:
+            t_s = channel.t_s + bend((channel.t_s - centre) / scale)
             if np.any(np.diff(t_s) <= 0):
                 return None
-            moved[id(one.t_s)] = t_s
-        result.append(Series(one.name, moved[id(one.t_s)], one.values))
+            moved[id(channel.t_s)] = t_s
+        result.append(Series(channel.name, moved[id(channel.t_s)], channel.values))
     design = place[:, None] ** np.arange(float(coefficients.size))
     rest = phase - design @ coefficients
     # Of the slope at the end less that at the start, over 2 scale^2.
@@ -463,17 +463,17 @@ def _polynomial(place: FloatArray, phase: FloatArray, least: float) -> FloatArra
     for degree in _DEGREES:
         if place.size <= degree + 2:
             break
-        found, value = _fitted(place, phase, degree)
+        coefficients, value = _fitted(place, phase, degree)
         rest: FloatArray = phase - value
         gained = float(before @ before - rest @ rest)
         clear = _stands_out(gained, 1, rest[None], degree + 1)
         if gained / place.size > (least / 4) ** 2 and clear:
-            chosen, before = found, rest
+            chosen, before = coefficients, rest
     return chosen
 
 
 def _fitted(place: FloatArray, values: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
     """Return the coefficients of a polynomial, ascending, and its values."""
     design = place[:, None] ** np.arange(degree + 1.0)
-    found = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64)
-    return found, np.asarray(design @ found, dtype=np.float64)
+    coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64)
+    return coefficients, np.asarray(design @ coefficients, dtype=np.float64)

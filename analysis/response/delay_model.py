@@ -181,12 +181,12 @@ def group_delay(
     Lines whose response isn't distinct from zero are left out. The slope's standard deviation is
     that of the scatter about the line where this is larger than what the variances explain.
     """
-    known = np.abs(value) ** 2 > 4 * variance
-    if known.sum() < 3:
+    clear = np.abs(value) ** 2 > 4 * variance
+    if clear.sum() < 3:
         return float("nan"), float("nan")
-    phase = np.unwrap(np.angle(value[known]))
-    weight = np.abs(value[known]) / np.sqrt(variance[known] / 2)
-    design = np.stack([-omega[known], np.ones(phase.size)], axis=1) * weight[:, None]
+    phase = np.unwrap(np.angle(value[clear]))
+    weight = np.abs(value[clear]) / np.sqrt(variance[clear] / 2)
+    design = np.stack([-omega[clear], np.ones(phase.size)], axis=1) * weight[:, None]
     solution, *_ = np.linalg.lstsq(design, phase * weight, rcond=None)
     residual = design @ solution - phase * weight
     spread = max(1.0, float(residual @ residual) / (phase.size - 2))
@@ -223,11 +223,11 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
         step /= _FINER
     if best is None or not best[0] <= _HOPELESS * 2 * lines.s.size:
         return None
-    found: Any = least_squares(
+    solution: Any = least_squares(
         lines.residual, best[1], jac=lines.jacobian, args=(top,), method="lm", max_nfev=400
     )
-    poles = np.roots(np.append(found.x[: top + 1 : -1], 1.0))
-    return found if (poles.real < 0).all() else None
+    poles = np.roots(np.append(solution.x[: top + 1 : -1], 1.0))
+    return solution if (poles.real < 0).all() else None
 
 
 def _linear(lines: _Lines, delays: FloatArray, top: int, bottom: int) -> FloatArray:

@@ -155,18 +155,18 @@ def _period(values: FloatArray) -> float | None:
     if not likely.size:
         return None
     curve = CubicSpline(np.arange(n, dtype=np.float64), values)
-    for whole, part, known in zip(lags[least[likely]], beside[likely], at[likely], strict=True):
+    for whole, part, coarse in zip(lags[least[likely]], beside[likely], at[likely], strict=True):
         lag, left = _exact_lag(curve, float(whole + part))
-        if min(known, left) < REPEATED:
-            return lag if left <= known else float(whole)
+        if min(coarse, left) < REPEATED:
+            return lag if left <= coarse else float(whole)
     return None
 
 
 def _minima(values: FloatArray, first: int) -> IntArray:
     """Return the local minima behind an index, without both ends."""
     inner = values[1:-1]
-    found = 1 + np.flatnonzero((inner <= values[:-2]) & (inner <= values[2:]))
-    return found[found > first]
+    minima = 1 + np.flatnonzero((inner <= values[:-2]) & (inner <= values[2:]))
+    return minima[minima > first]
 
 
 def _exact_lag(curve: CubicSpline, lag: float) -> tuple[float, float]:

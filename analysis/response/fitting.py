@@ -137,28 +137,28 @@ def fit_gait(
         The fit, or None, with a warning that says why, where there is no gait.
     """
     commands = _swinging(commands, warn)
-    known = list((commands or responses).values())
+    leading = list((commands or responses).values())
     kind = "commands" if commands else "responses"
     if commands:
-        found = find_groups(known, duration_s)
+        grouping = find_groups(leading, duration_s)
     else:  # through the body each response has the tones of all groups
-        rhythm = find_rhythm(known, duration_s)
-        found = None if rhythm is None else Groups((rhythm,), rhythm.explained)
-    if found is None or found.explained < MIN_EXPLAINED:
-        _warn_no_gait(known, found, kind, duration_s, warn)
+        rhythm = find_rhythm(leading, duration_s)
+        grouping = None if rhythm is None else Groups((rhythm,), rhythm.explained)
+    if grouping is None or grouping.explained < MIN_EXPLAINED:
+        _warn_no_gait(leading, grouping, kind, duration_s, warn)
         return None
     if not commands:
-        return _responses_only(responses, found.rhythms[0])
-    channels, amplitudes = _select(commands, responses, found, warn)
+        return _responses_only(responses, grouping.rhythms[0])
+    channels, amplitudes = _select(commands, responses, grouping, warn)
     rhythms = [
-        rhythm for rhythm, group in zip(found.rhythms, channels, strict=True) if group.driven
+        rhythm for rhythm, group in zip(grouping.rhythms, channels, strict=True) if group.driven
     ]
     channels = [group for group in channels if group.driven]
     if not channels:
         warn(Lacking("no gait: no joint has enough commands at the frequency that they share"))
         return None
     fits = _fit_groups(channels, [rhythm.omega for rhythm in rhythms], duration_s)
-    _warn_groups(found, fits, duration_s, warn)
+    _warn_groups(grouping, fits, duration_s, warn)
     groups = [
         _group_fit(group, fit, amplitudes, warn) for group, fit in zip(channels, fits, strict=True)
     ]
@@ -201,7 +201,7 @@ def _select(
     silent: list[str] = []
     channels: list[_Channels] = []
     for rhythm in groups.rhythms:
-        moving = [one for name, one in usable.items() if name in rhythm.names]
+        moving = [command for name, command in usable.items() if name in rhythm.names]
         if not moving:
             channels.append(_Channels((), (), []))
             continue
@@ -211,10 +211,10 @@ def _select(
             first = fit_at(moving, rhythm.omega, model)
         follows, astray = driven(first)
         sizes = np.abs(first.fundamental).tolist()
-        amplitudes |= zip((one.name for one in moving), sizes, strict=True)
-        chosen = [one for one, follow in zip(moving, follows, strict=True) if follow]
-        strays |= {one.name for one, stray in zip(moving, astray, strict=True) if stray}
-        moved = tuple(one.name for one in chosen)
+        amplitudes |= zip((command.name for command in moving), sizes, strict=True)
+        chosen = [command for command, follow in zip(moving, follows, strict=True) if follow]
+        strays |= {command.name for command, stray in zip(moving, astray, strict=True) if stray}
+        moved = tuple(command.name for command in chosen)
         followers |= set(moved)
         answered = tuple(n for n in moved if n in responses and enough(n, responses[n]))
         silent += [name for name in moved if name in responses and name not in answered]
@@ -309,21 +309,21 @@ def _paced(
     channels: list[Series], commands: int, fit: HarmonicFit
 ) -> tuple[Pace | None, list[Series], HarmonicFit]:
     """Take the channels over the phase of the commands, where their frequency moves."""
-    found: Pace | None = None
+    paced: Pace | None = None
     if fit.model.lines:
-        return found, channels, fit  # a group whose frequency moves has no constant lines
+        return paced, channels, fit  # a group whose frequency moves has no constant lines
     for _ in range(_PACE_ROUNDS):
-        least = MOVING if found is None else _CORRECTED * MOVING
+        least = MOVING if paced is None else _CORRECTED * MOVING
         pace = moving_pace(channels, commands, fit, least)
         if pace is None:
             break
-        before = 0.0 if found is None else found.drift
+        before = 0.0 if paced is None else paced.drift
         channels = pace.series
         turned = fit_shared(channels, fit.omega, fit.model)
         # The bent time stays as it is, whatever frequency is then found over it.
-        found = replace(pace, drift=(before + pace.drift) * turned.omega / fit.omega)
+        paced = replace(pace, drift=(before + pace.drift) * turned.omega / fit.omega)
         fit = turned
-    return found, channels, fit
+    return paced, channels, fit
 
 
 def _warn_changes(
@@ -377,14 +377,14 @@ def _warn_changes(
     if changes.uncertain:
         warn(
             f"gain and lag vary from cycle to cycle: {changes.cycles} cycles show their means only "
-            f"as well as {changes.found.effective:.2g} independent ones would, so the intervals "
+            f"as well as {changes.slow.effective:.2g} independent ones would, so the intervals "
             f"may be too narrow; record at least {_needed(changes)} cycles"
         )
 
 
 def _needed(changes: ResponseChanges) -> int:
     """Return the number of cycles of which enough would be independent, in tens."""
-    needed = changes.cycles * 1.5 * LEAST_EFFECTIVE / min(changes.found.effective, LEAST_EFFECTIVE)
+    needed = changes.cycles * 1.5 * LEAST_EFFECTIVE / min(changes.slow.effective, LEAST_EFFECTIVE)
     return -(-max(math.ceil(needed), 2 * LEAST_CYCLES) // 10) * 10
 
 
@@ -399,7 +399,7 @@ def _within(value: Estimate, unit: str, scale: float = 1.0) -> str:
 
 def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:
     usable = [response for response in responses.values() if _usable(response, rhythm.omega)]
-    moving = [one for one in usable if np.ptp(one.values) > 0]
+    moving = [response for response in usable if np.ptp(response.values) > 0]
     fit = fit_shared(moving, rhythm.omega, allowed_model(moving, rhythm.omega))
     variance, dof = omega_variance(fit, residual_noise(moving, fit))
     return GaitFit(fit, variance**0.5, dof, (), (), None, {})

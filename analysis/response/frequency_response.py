@@ -73,10 +73,10 @@ def frequency_responses(
     """
     moving = (name for name, command in commands.items() if moves(command.values))
     answered = (name for name in moving if name in responses and responses[name].count)
-    known = list(islice(answered, MOST_JOINTS))
+    names = list(islice(answered, MOST_JOINTS))
     if next(answered, None) is not None:
         warn(f"frequency responses are those of the first {MOST_JOINTS} joints that are driven")
-    sharing = _same_commands({name: commands[name] for name in known})
+    sharing = _same_commands({name: commands[name] for name in names})
 
     def of_joint(name: str) -> JointFrequencyResponse | None:
         external = (references or {}).get(name)
@@ -99,8 +99,10 @@ def frequency_responses(
             method=INDIRECT if reference else DIRECT,
         )
 
-    samples = sum(commands[name].count + responses[name].count for name in known)
-    return tuple(one for one in in_threads(of_joint, known, samples) if one is not None)
+    samples = sum(commands[name].count + responses[name].count for name in names)
+    return tuple(
+        response for response in in_threads(of_joint, names, samples) if response is not None
+    )
 
 
 def estimate(
@@ -116,8 +118,8 @@ def estimate(
         At the tones, or at up to :data:`LINES` frequencies of the excited band; None where the
         record is too short.
     """
-    known = [command, response, *([] if reference is None else [reference])]
-    return next(_estimates(known, excitation))
+    series = [command, response, *([] if reference is None else [reference])]
+    return next(_estimates(series, excitation))
 
 
 def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[LineResponse | None]:
@@ -148,7 +150,7 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
     yield None if whole is None else sound_lines(whole)
     half = t_s.size // 2
     for part in slice(half), slice(half, None):
-        yield None if whole is None else _of_band([one[part] for one in even], step, whole)
+        yield None if whole is None else _of_band([values[part] for values in even], step, whole)
 
 
 def _of_band(
@@ -165,7 +167,7 @@ def _of_band(
         Values are NaN where the part isn't excited; None where there are too few bins.
     """
     # Without the mean; a straight line taken off would leak unlike the rest.
-    u, y, *reference = (np.fft.rfft(one - one.mean()) for one in even)
+    u, y, *reference = (np.fft.rfft(values - values.mean()) for values in even)
     half = window(1, freedom=_FREEDOM)
     if u.size <= 4 * half:
         return None
@@ -175,16 +177,16 @@ def _of_band(
     if not bins.size:
         return None
     if at is None:
-        wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
-        chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
+        targets = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
+        chosen = np.array(sorted({int(bins[np.abs(bins - target).argmin()]) for target in targets}))
     else:
         chosen = np.unique(np.rint(at.frequency_hz * length_s).astype(np.int64))
         chosen = chosen[(chosen > 0) & (chosen < u.size)]
     if reference:
         value, variance, freedom = indirect_response(y, u, reference[0], chosen, half)
     else:
-        found = local_response(y, u[None], chosen, half)
-        value, variance, freedom = found.value[:, 0], found.variance[:, 0], found.freedom
+        local = local_response(y, u[None], chosen, half)
+        value, variance, freedom = local.value[:, 0], local.variance[:, 0], local.freedom
     value = np.where(np.isin(chosen, bins), value, np.nan)
     return LineResponse(chosen / length_s, value, variance, np.full(chosen.size, float(freedom)))
 
@@ -209,9 +211,9 @@ def sound_lines(lines: LineResponse) -> LineResponse:
     """Leave out lines without a value, and give those without noise that of rounding."""
     gain = np.abs(lines.value)
     variance = np.maximum(lines.variance, (_ROUNDING * gain) ** 2)
-    known = np.isfinite(gain) & np.isfinite(variance) & (variance > 0) & (lines.freedom > 0)
+    sound = np.isfinite(gain) & np.isfinite(variance) & (variance > 0) & (lines.freedom > 0)
     return LineResponse(
-        lines.frequency_hz[known], lines.value[known], variance[known], lines.freedom[known]
+        lines.frequency_hz[sound], lines.value[sound], variance[sound], lines.freedom[sound]
     )
 
 
@@ -224,10 +226,10 @@ def _unbroken(series: Sequence[Series]) -> list[Series]:
     start = max(channel.t_s[0] for channel in series)
     stop = min(channel.t_s[-1] for channel in series)
     breaks = [(stop, start)] if start > stop else []
-    for one in series:
-        step = np.diff(one.t_s)
+    for record in series:
+        step = np.diff(record.t_s)
         long = np.flatnonzero(step > _LONG_GAP * (stop - start))
-        breaks.extend(zip(one.t_s[long].tolist(), one.t_s[long + 1].tolist(), strict=True))
+        breaks.extend(zip(record.t_s[long].tolist(), record.t_s[long + 1].tolist(), strict=True))
     starts = [start, *(after for _, after in breaks)]
     stops = [min([stop, *(before for before, _ in breaks if before >= start)]) for start in starts]
     k = int(np.argmax(np.subtract(stops, starts)))
@@ -268,7 +270,7 @@ def joint_response(
     gain = np.abs(lines.value)
     sd = np.sqrt(lines.variance / 2)
     reach: FloatArray = np.asarray(stdtrit(2 * lines.freedom, 0.975) * sd, dtype=np.float64)
-    known = gain > lines.radius()
+    clear = gain > lines.radius()
     model = fit_delay(
         lines.frequency_hz, lines.value, lines.variance, float(np.median(lines.freedom))
     )
@@ -286,7 +288,7 @@ def joint_response(
         lag_rad=tuple(lag.tolist()),
         lag_ci95=tuple(
             interval if sure else None
-            for interval, sure in zip(_intervals(lag, reach / gain), known, strict=True)
+            for interval, sure in zip(_intervals(lag, reach / gain), clear, strict=True)
         ),
         coherence=tuple((gain**2 / (gain**2 + lines.variance)).tolist()),
         delay_s=delay,
@@ -339,7 +341,7 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     # The last periods: at the beginning there may be a transient.
     t_s = command.t_s[-1] - np.arange(periods * length)[::-1] * step
     shape = (periods, length)
-    u, y = (np.fft.rfft(resampled(one, t_s).reshape(shape)) for one in (command, response))
+    u, y = (np.fft.rfft(resampled(series, t_s).reshape(shape)) for series in (command, response))
     lines = excited_lines(u.mean(axis=0)[None])
     power = line_power(y)
     free = np.setdiff1d(np.arange(int(lines[0]), int(lines[-1])), lines, assume_unique=True)

@@ -149,14 +149,14 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     size = np.sqrt(common.fit.total / common.fit.count)
     lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
     # Whether the common rhythm is each channel's own and not a subharmonic of it.
-    own = (common.fit.explained >= _CLEAR) & (_fundamental_share(common.fit) >= _OWN_SHARE)
-    if np.all(own[lively]):
+    fundamental = (common.fit.explained >= _CLEAR) & (_fundamental_share(common.fit) >= _OWN_SHARE)
+    if np.all(fundamental[lively]):
         return Groups((common,), common.explained)
-    active = [one for one, chosen in zip(moving, lively, strict=True) if chosen]
+    active = [channel for channel, chosen in zip(moving, lively, strict=True) if chosen]
     tones = [
-        _Tone(one, rhythm)
-        for one in active
-        if (rhythm := find_rhythm([one], duration_s)) is not None
+        _Tone(channel, rhythm)
+        for channel in active
+        if (rhythm := find_rhythm([channel], duration_s)) is not None
         and rhythm.explained >= MIN_EXPLAINED
         and _fundamental_share(rhythm.fit)[0] >= _OWN_SHARE
     ]
@@ -172,17 +172,19 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
         return Groups((common,), common.explained, tuple(unresolved))
     left = {name for close in unresolved for name in close.left}
     grouped = {name for rhythm in rhythms for name in rhythm.names}
-    rest = [one for one in active if one.name not in grouped | left]
+    rest = [channel for channel in active if channel.name not in grouped | left]
     rhythms = _with_compound(rhythms, active, rest, duration_s)
-    rhythms.sort(key=lambda one: (-len(one.names), -float(one.fit.total.sum()), one.omega))
+    rhythms.sort(
+        key=lambda rhythm: (-len(rhythm.names), -float(rhythm.fit.total.sum()), rhythm.omega)
+    )
     total = float(common.fit.total.sum())
     undecided = [tone.rhythm for tone in tones if tone.series.name in left]
-    known = sum(
+    explained = sum(
         float((rhythm.fit.total - rhythm.fit.rss).sum()) for rhythm in (*rhythms, *undecided)
     )
     grouped = {name for rhythm in rhythms for name in rhythm.names}
-    astray = tuple(one.name for one in active if one.name not in grouped | left)
-    return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
+    astray = tuple(channel.name for channel in active if channel.name not in grouped | left)
+    return Groups(tuple(rhythms), explained / total, tuple(unresolved), astray)
 
 
 def _fundamental_share(fit: HarmonicFit) -> FloatArray:
@@ -194,7 +196,7 @@ def _fundamental_share(fit: HarmonicFit) -> FloatArray:
 
 def _clusters(tones: Sequence[_Tone], apart: float) -> list[list[_Tone]]:
     """Tones whose frequencies have no gap wider than ``apart`` [rad/s] between them."""
-    ordered = sorted(tones, key=lambda one: one.rhythm.omega)
+    ordered = sorted(tones, key=lambda tone: tone.rhythm.omega)
     clusters: list[list[_Tone]] = [ordered[:1]] if ordered else []
     for before, after in pairwise(ordered):
         if after.rhythm.omega - before.rhythm.omega < apart:
@@ -217,13 +219,13 @@ def _one_rhythm(cluster: Sequence[_Tone], same: float) -> tuple[Rhythm | None, U
     if len(parts) == 1:
         return rhythm, None
     low, high = (cluster[k].rhythm.omega / (2 * np.pi) for k in (0, -1))
-    names = tuple(one.series.name for one in cluster)
+    names = tuple(tone.series.name for tone in cluster)
     if rhythm is not None and np.all(rhythm.fit.explained >= MIN_EXPLAINED):
         return rhythm, Unresolved(names, (), low, high)
     largest = max(
         parts, key=lambda part: (len(part), sum(float(t.rhythm.fit.total.sum()) for t in part))
     )
-    kept = tuple(one.series.name for one in largest)
+    kept = tuple(tone.series.name for tone in largest)
     left = tuple(name for name in names if name not in kept)
     return _shared(largest), Unresolved(kept, left, low, high)
 
@@ -246,13 +248,15 @@ def _with_compound(
         enough = all(channel.count > model.size + 1 for channel in series)
         return fit_at(series, omegas[group], model) if enough else None
 
-    for one in rest:
-        found = [fit for group in range(len(omegas)) if (fit := fitted([one], group)) is not None]
-        if len(found) == len(omegas) and found[0].explained[0] >= MIN_EXPLAINED:
-            names[int(np.argmax([abs(fit.fundamental[0]) for fit in found]))].add(one.name)
+    for remaining in rest:
+        fits = [
+            fit for group in range(len(omegas)) if (fit := fitted([remaining], group)) is not None
+        ]
+        if len(fits) == len(omegas) and fits[0].explained[0] >= MIN_EXPLAINED:
+            names[int(np.argmax([abs(fit.fundamental[0]) for fit in fits]))].add(remaining.name)
     result: list[Rhythm] = []
     for group, rhythm in enumerate(rhythms):
-        members = [one for one in active if one.name in names[group]]
+        members = [channel for channel in active if channel.name in names[group]]
         fit = fitted(members, group)
         if fit is None or (len(rhythms) == 1 and len(members) == len(rhythm.names)):
             result.append(rhythm)
@@ -349,10 +353,10 @@ def with_mixed_lines(
         fit = fit_at(responses, omega, model)
         level = residual_noise(responses, fit).level
         power = _periodogram(responses, fit, np.array(candidates, dtype=np.float64))
-        known = level > 0
-        total = np.sum(power[known] / level[known, None], axis=0)
+        noisy = level > 0
+        total = np.sum(power[noisy] / level[noisy, None], axis=0)
         best = int(np.argmax(total))
-        shape = max(int(np.count_nonzero(known)), 1)
+        shape = max(int(np.count_nonzero(noisy)), 1)
         if float(total[best]) <= float(gammainccinv(shape, _CHANCE / len(candidates))):
             break
         line = candidates[best]
@@ -400,16 +404,16 @@ def _candidates(
 ) -> list[float]:
     """Mixed tones near a group's tone, resolved from it, its harmonics and the lines there are."""
     omega = omegas[group]
-    own = [0.0, *(order * omega for order in range(1, model.harmonics + 1))]
-    found: list[float] = []
+    modelled = [0.0, *(order * omega for order in range(1, model.harmonics + 1))]
+    mixed: list[float] = []
     for factors in _combinations(len(omegas), MODELLED_ORDER):
         line = abs(sum((factor * omegas[k] for k, factor in factors.items()), 0.0))
-        resolved = min(abs(line - other) for other in own) > _ORTHOGONAL * bin_rad_s
+        resolved = min(abs(line - other) for other in modelled) > _ORTHOGONAL * bin_rad_s
         apart = min((abs(line - other) for other in model.lines), default=float("inf"))
         near = abs(line - omega) <= _FAR * bin_rad_s
         if near and line <= highest and resolved and apart > _APART * bin_rad_s:
-            found.append(line)
-    return found
+            mixed.append(line)
+    return mixed
 
 
 def _periodogram(series: Sequence[Series], fit: HarmonicFit, omegas: FloatArray) -> FloatArray:

@@ -165,12 +165,12 @@ def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
         return None
     if not 0 < peaks.size <= MOST_TONES or (np.diff(peaks) < SEPARATION).any():
         return None
-    found = peaks / (even.size * command.period_s)
+    tones_hz = peaks / (even.size * command.period_s)
     for _ in range(_STEPS):
-        found = found + _step(command, found)
-    residual = command.values - _fitted(command, found)
+        tones_hz = tones_hz + _step(command, tones_hz)
+    residual = command.values - _fitted(command, tones_hz)
     left = np.var(residual) / np.var(command.values)
-    return found if left <= 1 - EXPLAINED else None
+    return tones_hz if left <= 1 - EXPLAINED else None
 
 
 def _blackman_harris(count: int) -> FloatArray:
@@ -198,7 +198,7 @@ def tone_response(
     inputs, outputs = _amplitudes(command, tones_hz), _amplitudes(response, tones_hz)
     value = outputs / inputs
     used = (response, command) if looped else (response,)
-    left = [one.values - _fitted(one, tones_hz) for one in used]
+    left = [series.values - _fitted(series, tones_hz) for series in used]
     length_s = response.t_s[-1] - response.t_s[0]
     noise, freedom = np.empty(tones_hz.size), np.empty(tones_hz.size)
     for k, tone in enumerate(tones_hz):
@@ -251,8 +251,8 @@ def _solve(series: Series, design: FloatArray) -> FloatArray:
 
 def _amplitudes(series: Series, tones_hz: FloatArray) -> ComplexArray:
     """Return A_k of equation (1), shape (k,)."""
-    found = _solve(series, _design(series.t_s, tones_hz))[_DRIFT + 1 :]
-    return found[: tones_hz.size] - 1j * found[tones_hz.size :]
+    coefficients = _solve(series, _design(series.t_s, tones_hz))[_DRIFT + 1 :]
+    return coefficients[: tones_hz.size] - 1j * coefficients[tones_hz.size :]
 
 
 def _fitted(series: Series, tones_hz: FloatArray) -> FloatArray:
@@ -418,8 +418,8 @@ def indirect_response(
     """
     # Variances are quadratic forms of the output: those of sums give the covariance of e_y and e_u.
     y, u, in_phase, turned = (
-        local_response(one, reference[None], bins, half)
-        for one in (output, command, output + command, output + 1j * command)
+        local_response(values, reference[None], bins, half)
+        for values in (output, command, output + command, output + 1j * command)
     )
     power_y, power_u = y.variance[:, 0], u.variance[:, 0]
     real = (in_phase.variance[:, 0] - power_y - power_u) / 2

@@ -166,7 +166,7 @@ def refine(series: Sequence[Series], omega: float) -> Rhythm | None:
 
 def liveliest(series: Sequence[Series]) -> list[Series]:
     """Return the few channels that move most, from which a frequency is found."""
-    return sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
+    return sorted(series, key=lambda channel: float(np.var(channel.values)), reverse=True)[:_SCOUTS]
 
 
 def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
@@ -193,11 +193,11 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     Only a starting point: the channels are interpolated to an even grid and tapered, and the
     Gauss-Newton fit does the rest on the true times.
     """
-    step = max(one.period_s for one in scouts)
-    start = max(one.t_s[0] for one in scouts)
-    stop = min(one.t_s[-1] for one in scouts)
+    step = max(scout.period_s for scout in scouts)
+    start = max(scout.t_s[0] for scout in scouts)
+    stop = min(scout.t_s[-1] for scout in scouts)
     count = int((stop - start) / step) + 1 if stop > start and step > 0 else 0
-    if not 16 <= count <= _SPARSEST * max(one.count for one in scouts):
+    if not 16 <= count <= _SPARSEST * max(scout.count for scout in scouts):
         return None
     grid = start + step * np.arange(count)
     length = 1 << int(np.ceil(np.log2(_PADDING * count)))

@@ -159,7 +159,7 @@ def why_no_gait(
     Returns:
         A sentence without its full stop.
     """
-    if not any(moves(one.values) for one in series):
+    if not any(moves(channel.values) for channel in series):
         return f"no gait: the {kind} never move; {_NULLS}"
     if isinstance(unusable, TooSeldom):
         return f"no gait: {too_seldom_in_words(unusable, kind)}; {_NULLS}"

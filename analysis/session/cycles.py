@@ -145,8 +145,8 @@ def response_over_time(
         if phase is None or name not in columns.command or name not in columns.position:
             return None
         command, response = (
-            clean(name, one.t_ns, one.values, origin_ns)
-            for one in (columns.command[name], columns.position[name])
+            clean(name, signal.t_ns, signal.values, origin_ns)
+            for signal in (columns.command[name], columns.position[name])
         )
         if command.count < 2 or np.ptp(command.values) == 0 or response.count < 2:
             return None
@@ -154,9 +154,11 @@ def response_over_time(
         pairs = zip(paces[main], paces[phase], strict=True)
         return _joint(command, response, [*pairs], false=false.get(name, []), settled_s=settled_s)
 
-    samples = sum(one.t_ns.size for one in (*columns.command.values(), *columns.position.values()))
-    found = in_threads(of_joint, columns.names, samples, session.forget)
-    joints = [one for one in found if one is not None]
+    samples = sum(
+        signal.t_ns.size for signal in (*columns.command.values(), *columns.position.values())
+    )
+    results = in_threads(of_joint, columns.names, samples, session.forget)
+    joints = [result for result in results if result is not None]
     if not any(any(g is not None for g in joint.gain) for joint in joints):
         why = "no whole cycle of the logged phase drives a joint"
         warn(Note(f"gain and lag over time are null: {why}"))
@@ -171,19 +173,19 @@ def _logged(session: SessionView, warn: Warn) -> LoggedGait | None:
     why = f"the session has no {GAIT_TOPIC}"
     if GAIT_TOPIC in session.channels:
         try:
-            found = session.joints(GAIT_TOPIC)
+            logged = session.joints(GAIT_TOPIC)
         except (DataError, LogError) as error:
             why = str(error)
         else:
-            values = dict(zip(found.names, found.values, strict=True))
-            even = len({t.size for t in found.t_ns}) == 1 and found.t_ns[0].size > 2
+            values = dict(zip(logged.names, logged.values, strict=True))
+            even = len({t.size for t in logged.t_ns}) == 1 and logged.t_ns[0].size > 2
             if even and any(name.endswith(".phase") for name in values):
-                t_s = (found.t_ns[0] - session.start_ns).astype(np.float64) * 1e-9
+                t_s = (logged.t_ns[0] - session.start_ns).astype(np.float64) * 1e-9
                 finite = np.isfinite(np.stack(list(values.values()))).all(axis=0)
-                known = {name: value[finite] for name, value in values.items()}
+                by_name = {name: value[finite] for name, value in values.items()}
                 # A log may keep its phases within a turn, or not.
-                known |= {k: np.unwrap(v) for k, v in known.items() if k.endswith(".phase")}
-                return LoggedGait(t_s[finite], known)
+                by_name |= {k: np.unwrap(v) for k, v in by_name.items() if k.endswith(".phase")}
+                return LoggedGait(t_s[finite], by_name)
             why = f"{GAIT_TOPIC} logs no phase"
     warn(Note(f"gain and lag over time are null: {why}"))
     return None
@@ -202,23 +204,23 @@ def _joint(
     asked: list[ComplexArray] = []
     given: list[ComplexArray] = []
     number: list[int] = []
-    for k, (main, own) in enumerate(paces):
-        if main is None or own is None or main.edges_s.size < 2:
+    for k, (main, pace) in enumerate(paces):
+        if main is None or pace is None or main.edges_s.size < 2:
             continue
-        pair = demodulate(command, response, own.phase, main.edges_s)
+        pair = demodulate(command, response, pace.phase, main.edges_s)
         edges.append(main.edges_s)
         asked.append(pair[0])
         given.append(pair[1])
         number += [k] * (main.edges_s.size - 1)
     if not edges:
         return JointOverTime(command.name, *[()] * 8)
-    found = cycles_of(edges, asked, given, settled_s=settled_s)
+    cycles = cycles_of(edges, asked, given, settled_s=settled_s)
     for start, stop in false:
-        found.ratio[(found.start_s < stop) & (found.stop_s > start)] = np.nan
-    frequency = 1 / (found.stop_s - found.start_s)
-    start, stop = tuple(found.start_s.tolist()), tuple(found.stop_s.tolist())
+        cycles.ratio[(cycles.start_s < stop) & (cycles.stop_s > start)] = np.nan
+    frequency = 1 / (cycles.stop_s - cycles.start_s)
+    start, stop = tuple(cycles.start_s.tolist()), tuple(cycles.stop_s.tolist())
     rates = tuple(frequency.tolist())
-    return JointOverTime(command.name, start, stop, tuple(number), rates, *_estimates(found))
+    return JointOverTime(command.name, start, stop, tuple(number), rates, *_estimates(cycles))
 
 
 def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
@@ -232,22 +234,22 @@ def _estimates(cycles: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
     factor = t_factor(cycles.dof) if cycles.dof > 0 else float("nan")
     gain, lag = np.abs(cycles.ratio), -np.angle(cycles.ratio)
     half = factor * np.sqrt(cycles.variance)
-    known = np.isfinite(cycles.ratio) & (gain > 0)
-    sure = known & (half < 1)
+    valid = np.isfinite(cycles.ratio) & (gain > 0)
+    sure = valid & (half < 1)
     half = np.where(sure, half, 0.0)
     low, high = gain * np.exp(-half), gain * np.exp(half)
     early, late = lag - np.arcsin(half), lag + np.arcsin(half)
     return (
-        _where(known, gain.tolist()),
+        _where(valid, gain.tolist()),
         _where(sure, zip(low.tolist(), high.tolist(), strict=True)),
-        _where(known, lag.tolist()),
+        _where(valid, lag.tolist()),
         _where(sure, zip(early.tolist(), late.tolist(), strict=True)),
     )
 
 
-def _where(known: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, ...]:
+def _where(valid: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, ...]:
     """Return the values, or None where they are not known."""
-    pairs = zip(values, known.tolist(), strict=True)
+    pairs = zip(values, valid.tolist(), strict=True)
     return tuple(value if there else None for value, there in pairs)
 
 

@@ -104,14 +104,14 @@ def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
     changes = gait.changes
     if changes is None:
         return facts
-    turn = changes.found.turn if changes.trend is Trend.SETTLING else 0.0
+    turn = changes.slow.turn if changes.trend is Trend.SETTLING else 0.0
     return dataclasses.replace(
         facts,
         trend=str(changes.trend),
         time_constant_s=changes.time_constant_s,
         oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
-        cycle_correlation=max(changes.found.correlation) if changes.varies else None,
-        effective_cycles=changes.found.effective if changes.varies else None,
+        cycle_correlation=max(changes.slow.correlation) if changes.varies else None,
+        effective_cycles=changes.slow.effective if changes.varies else None,
         amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
     )
 
@@ -155,9 +155,9 @@ def joint_results(
         response = responses.get(name)
         part = None if response is None else response.between(span.start_s, span.stop_s)
         fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
-        own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
-        if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
-            own.append("gaps")
+        joint_flags = [flag for flag in flags.get(name, ()) if flag != "gaps"]
+        if fraction < 1 - GAP_SHARE and "not_recorded" not in joint_flags:
+            joint_flags.append("gaps")
         index = None if gait is None else gait.group_of(name)
         group = None if gait is None or index is None else gait.groups[index]
         gain, lag = response_estimates(group, name)
@@ -170,12 +170,12 @@ def joint_results(
                 gain=gain,
                 lag_rad=lag,
                 **{
-                    f"energy_{term}_j": None if found is None else float(np.sum(found))
-                    for term, found in per_cycle.items()
+                    f"energy_{term}_j": None if energy is None else float(np.sum(energy))
+                    for term, energy in per_cycle.items()
                 },
                 coverage=fraction,
                 samples=0 if part is None else part.count,
-                flags=tuple(own),
+                flags=tuple(joint_flags),
                 group=index,
                 frequency_hz=None if group is None else group.fit.frequency_hz,
                 dead_band=dead.get(name),
@@ -207,7 +207,7 @@ def _changes(gait: GaitFit | None, name: str) -> dict[str, Any]:
     if gait is None or gait.changes is None or name not in gait.answered:
         return {}
     changes, place = gait.changes, gait.answered.index(name)
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     if changes.trend is not Trend.STEADY:
         drifts = changes.trend is Trend.DRIFTING
         keys = (
@@ -215,7 +215,7 @@ def _changes(gait: GaitFit | None, name: str) -> dict[str, Any]:
             if drifts
             else ("gain_transient", "lag_transient_rad")
         )
-        found |= zip(keys, changes.of_joint(place), strict=True)
+        fields |= zip(keys, changes.of_joint(place), strict=True)
     if changes.varies:
-        found["gain_cycle_sd"], found["lag_cycle_sd_rad"] = changes.scatter[:, place].tolist()
-    return found
+        fields["gain_cycle_sd"], fields["lag_cycle_sd_rad"] = changes.scatter[:, place].tolist()
+    return fields

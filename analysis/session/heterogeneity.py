@@ -133,7 +133,7 @@ def response_indices(response: Response) -> dict[str, Index]:
     both = spread(np.concatenate([np.log(gain), lag]), variances, dof, blocks=2)
     gains = spread(relative, gain_variance, dof)
     lags = _circular(lag, spread(lag, lag_variance, dof))
-    found: dict[str, tuple[float, Interval | None, float]] = {
+    entries: dict[str, tuple[float, Interval | None, float]] = {
         "gain_cv": (gains.deviation, gains.interval, gains.p),
         "lag_sd": (lags.deviation, lags.interval, lags.p),
         "common_response": (both.ratio, None, both.p),
@@ -141,9 +141,11 @@ def response_indices(response: Response) -> dict[str, Index]:
         "equivalence_lag": _equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
     }
     if count >= MIDDLE + ENDS:
-        found["boundary_contrast_gain"] = _contrast(gain, response.log_gain_variance * gain**2, dof)
-        found["boundary_contrast_lag"] = _contrast(lag, lag_variance, dof)
-    return {name: index(name, *numbers) for name, numbers in found.items()}
+        entries["boundary_contrast_gain"] = _contrast(
+            gain, response.log_gain_variance * gain**2, dof
+        )
+        entries["boundary_contrast_lag"] = _contrast(lag, lag_variance, dof)
+    return {name: index(name, *numbers) for name, numbers in entries.items()}
 
 
 def energy_indices(per_cycle_j: FloatArray) -> dict[str, Index]:
@@ -160,7 +162,8 @@ def energy_indices(per_cycle_j: FloatArray) -> dict[str, Index]:
         return {}
     return {
         "energy_cv": index(
-            "energy_cv", *_jackknifed(per_cycle_j, lambda one: float(one.std() / one.mean()))
+            "energy_cv",
+            *_jackknifed(per_cycle_j, lambda energy: float(energy.std() / energy.mean())),
         ),
         "energy_gini": index("energy_gini", *_jackknifed(per_cycle_j, gini)),
     }
@@ -262,7 +265,7 @@ def _jackknifed(
     rest = total[:, None] - per_cycle  # (k, c)
     if not rest.any(axis=0).all():  # all of the energy is in one cycle
         return value, None
-    partial = np.array([statistic(one) for one in rest.T])
+    partial = np.array([statistic(total) for total in rest.T])
     error = ((cycles - 1) / cycles * np.sum((partial - partial.mean()) ** 2)) ** 0.5
     half = t_factor(cycles - 1) * float(error)
     return value, (max(0.0, value - half), value + half)
@@ -291,27 +294,27 @@ def heterogeneity_indices(
     if gait is None or all(group.response is None for group in gait.groups):
         warn(Note("no joint's gain and lag are known: the heterogeneity indices are null"))
         return unknown
-    known = {joint.name for joint in joints if joint.lag_rad.value is not None}
-    old = {joint.name for joint in joints if joint.name in known and "stale" in joint.flags}
-    if old != known:  # where all samples are late by a hold, that makes no difference
-        known -= old
+    lagged = {joint.name for joint in joints if joint.lag_rad.value is not None}
+    old = {joint.name for joint in joints if joint.name in lagged and "stale" in joint.flags}
+    if old != lagged:  # where all samples are late by a hold, that makes no difference
+        lagged -= old
     groups = [by_plane(robot, group.driven) for group in gait.groups]
     planes = list(dict.fromkeys(plane for group in groups for plane in group))
     result: dict[str, Index] = {}
     parts = [(plane, k) for plane in planes for k, group in enumerate(groups) if plane in group]
     for plane, k in parts:
         names = groups[k][plane]
-        sound = [name for name in names if name in known]
+        sound = [name for name in names if name in lagged]
         several = sum(plane in group for group in groups) > 1
         label = f"{plane} {gait.groups[k].fit.frequency_hz:.4g} Hz" if several else plane
-        found = unknown | _of_plane(label, names, sound, gait.groups[k], warn)
+        indices = unknown | _of_plane(label, names, sound, gait.groups[k], warn)
         powers = [energies[name].mechanical for name in sound]
         per_cycle = [power.abs_j for power in powers if power is not None]
         if per_cycle and len(per_cycle) == len(sound):
-            found |= energy_indices(np.stack(per_cycle))
+            indices |= energy_indices(np.stack(per_cycle))
         suffix = f"_{plane}" if len(planes) > 1 else ""
         suffix += f"_group{k}" if several else ""
-        result |= {f"{name}{suffix}": one for name, one in found.items()}
+        result |= {f"{name}{suffix}": value for name, value in indices.items()}
     text = "boundary or module: not separable from a wave in one direction (module_share is null)"
     warn(Note(f"{text}; record the reverse"))
     return result
@@ -325,7 +328,7 @@ def _of_plane(
         few = f"fewer than two {plane} joints have a response"
         warn(Note(f"{few}: its heterogeneity indices are null"))
         return {}
-    found = response_indices(gait.response.select([gait.answered.index(name) for name in sound]))
+    indices = response_indices(gait.response.select([gait.answered.index(name) for name in sound]))
     if len(names) < MIDDLE + ENDS:
         few = f"{len(names)} driven {plane} joints are too few for a contrast of the ends"
         warn(Note(f"{few} with the middle {MIDDLE}: the boundary contrasts are null"))
@@ -334,5 +337,7 @@ def _of_plane(
             f"the {plane} indices leave out joints without gain and lag; the boundary contrasts, "
             "which need them all, are null"
         )
-        found = {k: one for k, one in found.items() if not k.startswith("boundary_contrast")}
-    return found
+        indices = {
+            k: value for k, value in indices.items() if not k.startswith("boundary_contrast")
+        }
+    return indices

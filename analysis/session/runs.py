@@ -219,7 +219,7 @@ def gait_run(
     names = tuple(chain) if gait.others else gait.driven
     command = np.zeros(len(names), dtype=np.complex128)
     response = _unknown(len(names))
-    known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
+    answered = {joint.name for joint in analysis.joints if joint.gain.value is not None}
     planes: list[tuple[str, ...]] = []
     waves: list[str | None] = []
     for group in gait.groups:
@@ -229,12 +229,12 @@ def gait_run(
         waves.append(wave_name(phase_step(fundamental)) if fundamental.size > 1 else None)
         if group.response is None:
             continue
-        own = [k for k, joint in enumerate(group.answered) if joint in known]
-        at = [names.index(group.answered[k]) for k in own]
-        response.ratio[at] = group.response.ratio[own]
-        response.log_gain_variance[at] = group.response.log_gain_variance[own]
-        response.lag_variance[at] = group.response.lag_variance[own]
-        response.dof[at] = group.response.dof[own]
+        members = [k for k, joint in enumerate(group.answered) if joint in answered]
+        at = [names.index(group.answered[k]) for k in members]
+        response.ratio[at] = group.response.ratio[members]
+        response.log_gain_variance[at] = group.response.log_gain_variance[members]
+        response.lag_variance[at] = group.response.lag_variance[members]
+        response.dof[at] = group.response.dof[members]
     return GaitRun(
         label=label,
         robot=name,
@@ -296,12 +296,12 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
         imaginary parts within pi of their common mean.
     """
     ratio = np.stack([run.ratio for run in runs])
-    known = np.all(np.isfinite(ratio), axis=0)
-    known &= known[::-1]
-    ratio = ratio[:, known]
+    finite = np.all(np.isfinite(ratio), axis=0)
+    finite &= finite[::-1]
+    ratio = ratio[:, finite]
     turn = np.angle((ratio / np.abs(ratio)).sum())
     phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
-    names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
+    names = tuple(name for name, sound in zip(runs[0].names, finite, strict=True) if sound)
     return names, (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
 
 
@@ -378,9 +378,9 @@ def other_frequency(run: GaitRun, model: GaitRun) -> tuple[str, str] | None:
         where they agree.
     """
     pairs = zip_longest(run.frequencies_hz, model.frequencies_hz, fillvalue=float("nan"))
-    for own, other in pairs:
-        if not abs(own - other) <= SAME_FREQUENCY * other:
-            return distinct(own, other)
+    for frequency, other in pairs:
+        if not abs(frequency - other) <= SAME_FREQUENCY * other:
+            return distinct(frequency, other)
     return None
 
 

@@ -128,16 +128,17 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
     if at.size == 0:
         return nothing
     before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
-    own = step[at] - (step[before] + step[after]) / 2  # without what the joint itself did meanwhile
-    turn = float(np.median(np.abs(own)))
+    # Without what the joint itself did meanwhile.
+    excess = step[at] - (step[before] + step[after]) / 2
+    turn = float(np.median(np.abs(excess)))
     spread = SAME_SIZE * turn + 2 * float(np.median(np.abs(step)))
-    alike = bool(np.all(np.abs(np.abs(own) - turn) < spread))
+    alike = bool(np.all(np.abs(np.abs(excess) - turn) < spread))
     # Lone steps of any size may be a jump; a counter's single wrap is known by its size.
-    known = any(abs(turn - one) < spread for one in _TURNS)
-    if not alike or not (known or (at.size > 2 and np.ptp(value) < 2 * turn)):
+    whole_turn = any(abs(turn - size) < spread for size in _TURNS)
+    if not alike or not (whole_turn or (at.size > 2 and np.ptp(value) < 2 * turn)):
         return Jumps((), 0.0, tuple((float(t_s[k]), float(t_s[k + 1])) for k in at))
     turns = np.zeros(value.size)
-    turns[at + 1] = np.rint(own / turn)
+    turns[at + 1] = np.rint(excess / turn)
     count = np.cumsum(turns)
     levels, index = np.unique(count, return_inverse=True)
     return Jumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
@@ -169,7 +170,7 @@ class Limits:
         torque: At standstill and full voltage [N m].
         current: At standstill and full voltage [A].
         voltage: Of the supply [V].
-        known: Whether the servo's values are known rather than assumed.
+        stated: Whether the servo's values are known rather than assumed.
     """
 
     lower: float
@@ -178,13 +179,13 @@ class Limits:
     torque: float
     current: float
     voltage: float
-    known: bool
+    stated: bool
 
     @property
     def values(self) -> tuple[float, ...]:
         """All of them, both signs: values at which a channel may stay by itself."""
         sizes = (self.rate, self.torque, self.current, self.voltage)
-        return (self.lower, self.upper, *sizes, *(-one for one in sizes))
+        return (self.lower, self.upper, *sizes, *(-size for size in sizes))
 
 
 def limits_of(session: SessionView) -> dict[str, Limits]:
@@ -200,12 +201,12 @@ def limits_of(session: SessionView) -> dict[str, Limits]:
     if robot is None:
         return {}
     # A twin's servos are as they are stated, whatever the robot's may be.
-    known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
+    stated = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
     limits: dict[str, Limits] = {}
     for joint in robot.joints:
         servo = joint.servo
         sizes = (servo.stall_torque, servo.supply_v / servo.resistance_ohm, servo.supply_v)
-        limits[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, known)
+        limits[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, stated)
     return limits
 
 
@@ -255,7 +256,7 @@ def stalled(
     ends = position.at(effort.t_s[at] + half), position.at(effort.t_s[at] - half)
     rate = (ends[0] - ends[1]) / (2 * half)
     pushing[at[np.abs(rate) >= STANDING * usual_rate]] = False
-    found = spans_of(effort.t_s, pushing, join=2)
+    stalls = spans_of(effort.t_s, pushing, join=2)
     long = STALL_S
     if most is None:
         edges = turns(asked)
@@ -264,8 +265,8 @@ def stalled(
         # A sine is slower than the share s of its peak speed for 2 arcsin(s) / omega.
         omega = 2 * np.pi / float(np.median(np.diff(edges)))
         long = max(STALL_S, DWELL * 2 * float(np.arcsin(STANDING)) / omega)
-        found = tuple(span for span in found if _constant(effort, span))
-    return tuple(span for span in found if span[1] - span[0] >= long)
+        stalls = tuple(span for span in stalls if _constant(effort, span))
+    return tuple(span for span in stalls if span[1] - span[0] >= long)
 
 
 def _constant(effort: Series, span: Span) -> bool:
@@ -297,16 +298,22 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
     origin_ns = session.start_ns
 
     def of_joint(name: str) -> list[Artefact]:
-        own = {key: columns.of(key).get(name) for key in QUANTITIES}
-        raw = {key: one for key, one in own.items() if one is not None and one.t_ns.size}
-        series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
+        signals = {key: columns.of(key).get(name) for key in QUANTITIES}
+        raw = {
+            key: signal
+            for key, signal in signals.items()
+            if signal is not None and signal.t_ns.size
+        }
+        series = {
+            key: channel for key, channel in clean_together(raw, origin_ns).items() if channel.count
+        }
         joint = _Joint(name, raw, series, limits.get(name), name in commanded)
         return [
             Artefact(name, columns.topics.get(quantity, ""), quantity, flag, spans, note)
             for quantity, flag, spans, note in _of_joint(joint, origin_ns)
         ]
 
-    samples = sum(one.t_ns.size for key in QUANTITIES for one in columns.of(key).values())
+    samples = sum(signal.t_ns.size for key in QUANTITIES for signal in columns.of(key).values())
     return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples, session.forget)))
 
 
@@ -315,10 +322,10 @@ _Found = Iterator[tuple[str, str, tuple[Span, ...], str]]
 
 def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
     """Quantity, flag, stretches and note of whatever one joint shows."""
-    found = [*_of_sensors(joint)]
-    yield from found
+    of_sensors = [*_of_sensors(joint)]
+    yield from of_sensors
     # What a sensor falsifies says nothing about a limit.
-    false = {quantity for quantity, flag, _, _ in found if flag in FALSIFYING}
+    false = {quantity for quantity, flag, _, _ in of_sensors if flag in FALSIFYING}
     yield from (at_limit for at_limit in _at_limits(joint) if at_limit[0] not in false)
     for quantity in ("command", "position"):
         if quantity in joint.series:
@@ -330,7 +337,7 @@ def _of_sensors(joint: _Joint) -> _Found:
     command = joint.series.get("command") if joint.driven else None
     sensed = {key: series for key, series in joint.series.items() if key != "command"}
     against = {"position": command}
-    tops = {key: clipped(one, levels, against.get(key)) for key, one in sensed.items()}
+    tops = {key: clipped(channel, levels, against.get(key)) for key, channel in sensed.items()}
     if "position" not in joint.series:
         yield "position", "not_recorded", (), ""
     else:
@@ -365,15 +372,15 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     if jumps.jumped:
         edges = np.zeros(0) if motion is None else turns(motion)
         cycle = float(np.median(np.diff(edges))) if edges.size > 1 else 0.0
-        own = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
-        other = [(a - cycle, b + cycle) for a, b in own]
+        scaled = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
+        other = [(a - cycle, b + cycle) for a, b in scaled]
         if left := _apart(jumps.jumped, other):
             yield "position", "jump", left, ""
 
 
 def _linear(position: Series, command: Series) -> Series:
     """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
-    asked, moved = (Samples(one.t_s, one.values) for one in (command, position))
+    asked, moved = (Samples(channel.t_s, channel.values) for channel in (command, position))
     course = course_of([JointMotion(command.name, asked, moved)])
     if course is None or np.isfinite(cycle_s(course.command[0], course.step_s)):
         return command
@@ -389,10 +396,10 @@ def _of_scale(
     joint: _Joint, position: Series, command: Series | None, way: Series | None
 ) -> _Found:
     """Sign, unit and scale against the command, a second sensor and the velocity's integral."""
-    found: set[str] = set()
+    flags: set[str] = set()
     command, second, way = (
-        one if one is not None and np.ptp(one.values) > 0 else None
-        for one in (command, joint.series.get("reference"), way)
+        channel if channel is not None and np.ptp(channel.values) > 0 else None
+        for channel in (command, joint.series.get("reference"), way)
     )
     leader = command or second or way
     if leader is None:
@@ -400,21 +407,21 @@ def _of_scale(
     edges = turns(leader)
     if command is not None:
         leading = _linear(position, command)
-        both = (compare(position, one, edges) for one in (leading, rate_of(leading)))
+        both = (compare(position, channel, edges) for channel in (leading, rate_of(leading)))
         for flag, spans in against_command(*both).items():
-            found.add(flag)
+            flags.add(flag)
             yield "position", flag, spans, ""
     if second is not None:
         by_second = compare(position, second, edges, noisy=True)
         for flag, spans in against_witness(by_second, SAME_SCALE).items():
-            found.add(flag)
+            flags.add(flag)
             scale = float(np.nanmedian(by_second.ratio))
             yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
     if way is not None:
         by_rate = compare(position, way, edges, noisy=True)
         # What the position is blamed for already is no fault of the velocity.
         for flag, spans in against_witness(by_rate, SAME_RATE).items():
-            if flag not in found:
+            if flag not in flags:
                 scale = 1 / float(np.nanmedian(by_rate.ratio))
                 note = f"{scale:.3g} times the derivative of the position"
                 yield "velocity", flag, spans, note if flag == "scale_mismatch" else ""
@@ -422,7 +429,7 @@ def _of_scale(
 
 def _stalled(joint: _Joint) -> tuple[Span, ...]:
     position = joint.series["position"]
-    limits = joint.limits if joint.limits is not None and joint.limits.known else None
+    limits = joint.limits if joint.limits is not None and joint.limits.stated else None
     for quantity, most in (
         ("effort", limits and limits.torque),
         ("current", limits and limits.current),
@@ -439,11 +446,11 @@ def _at_limits(joint: _Joint) -> _Found:
         return
     for quantity in ("command", "position"):
         if quantity in joint.series:
-            one = joint.series[quantity]
-            if spans := saturated(one, limits.lower, limits.upper, AT_LIMIT_RAD):
+            channel = joint.series[quantity]
+            if spans := saturated(channel, limits.lower, limits.upper, AT_LIMIT_RAD):
                 yield quantity, "saturated", spans, "angle"
     sizes = [("velocity", limits.rate, "rate")]
-    if limits.known:
+    if limits.stated:
         sizes += [
             ("effort", limits.torque, "torque"),
             ("current", limits.current, "current"),
@@ -451,23 +458,23 @@ def _at_limits(joint: _Joint) -> _Found:
         ]
     for quantity, most, note in sizes:
         slack = (1 - AT_LIMIT) * most
-        one = joint.series.get(quantity)
-        if one is not None and (spans := saturated(one, -most, most, slack)):
+        channel = joint.series.get(quantity)
+        if channel is not None and (spans := saturated(channel, -most, most, slack)):
             yield quantity, "saturated", spans, note
 
 
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
-    raw, one = joint.raw[quantity], joint.series[quantity]
+    raw, channel = joint.raw[quantity], joint.series[quantity]
     seconds = (raw.t_ns - origin_ns).astype(np.float64) * 1e-9
-    if one.dropped_nan:
+    if channel.dropped_nan:
         yield quantity, "nan", spans_of(seconds, ~(np.abs(raw.values) <= LARGEST)), ""
-    if one.dropped_duplicates:
+    if channel.dropped_duplicates:
         again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))
         yield quantity, "duplicate_stamps", tuple((t, t) for t in np.unique(seconds[again])), ""
-    if one.count < 2:
+    if channel.count < 2:
         return
-    begin, end = one.t_s[one.gaps], one.t_s[one.gaps + 1]
-    if float(np.sum(end - begin)) > GAP_SHARE * (one.t_s[-1] - one.t_s[0]):
+    begin, end = channel.t_s[channel.gaps], channel.t_s[channel.gaps + 1]
+    if float(np.sum(end - begin)) > GAP_SHARE * (channel.t_s[-1] - channel.t_s[0]):
         yield quantity, "gaps", tuple(zip(begin.tolist(), end.tolist(), strict=True)), ""
 
 

@@ -125,7 +125,7 @@ def read_columns(
     topics = session.joint_topics(command_topic, response_topic)
     _check_robots(session, topics)
     command_topic, response_topic = topics.command, topics.response
-    wanted = {
+    sources = {
         "command": (command_topic, "position"),
         "position": (response_topic, "position"),
         "velocity": (response_topic, "velocity"),
@@ -136,7 +136,7 @@ def read_columns(
     }
     chosen = {"reference": reference_topic, "excitation": excitation_topic}
     chosen = {key: topic for key, topic in chosen.items() if topic is not None}
-    wanted |= {key: (topic, "position") for key, topic in chosen.items()}
+    sources |= {key: (topic, "position") for key, topic in chosen.items()}
     asked = [((command_topic, response_topic), HOW_TO_CHOOSE)]
     asked += [((topic,), f"choose with --{key}-topic") for key, topic in chosen.items()]
     for names, how in asked:
@@ -145,21 +145,23 @@ def read_columns(
             there = topics.others or sorted(session.channels)
             missing = " or ".join(names) + damage
             raise MissingChannelError(session.path, missing, there, how)
-    wanted = {key: one for key, one in wanted.items() if session.joint_channel(one[0])}
-    found = _read(session, wanted)
+    sources = {key: source for key, source in sources.items() if session.joint_channel(source[0])}
+    recorded = _read(session, sources)
     if response_topic == RESPONSE_TOPIC:
         # A bus that gives them in frames of their own has them on topics of their own.
-        own = {key: one for key, one in _OF_ITS_OWN.items() if one[0] in session.channels}
-        own = {key: one for key, one in own.items() if key not in found}
-        found |= _read(session, own) if own else {}
-        wanted |= own
+        separate = {
+            key: source for key, source in _OF_ITS_OWN.items() if source[0] in session.channels
+        }
+        separate = {key: source for key, source in separate.items() if key not in recorded}
+        recorded |= _read(session, separate) if separate else {}
+        sources |= separate
     for note in topics.notes:
         warn(Note(note))
     for key, kind, topic in (
         ("command", "commands", command_topic),
         ("position", "positions", response_topic),
     ):
-        if key not in found:
+        if key not in recorded:
             option = "--command-topic" if key == "command" else "--response-topic"
             named = f" (other joints: {', '.join(topics.others)}; choose with {option})"
             logged = "no command logged: " if key == "command" else ""
@@ -169,16 +171,16 @@ def read_columns(
                 warn(Leading(f"no commands of named joints: {why}; gain and lag are null"))
                 continue
             warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
-    accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
-    if not accumulated and ("velocity" not in found or "effort" not in found):
-        lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
+    accumulated = PowerTopic.MECHANICAL in recorded and PowerTopic.MECHANICAL_PLUS in recorded
+    if not accumulated and ("velocity" not in recorded or "effort" not in recorded):
+        lacking = " and ".join(key for key in ("effort", "velocity") if key not in recorded)
         warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
-    _check_nodes(session, found)
-    _check_voltage(session, found, warn)
+    _check_nodes(session, recorded)
+    _check_voltage(session, recorded, warn)
     seen = dict.fromkeys(session.robot.joint_names if session.robot is not None else ())
     for key in ("command", "position"):
-        if key in found:
-            seen |= dict.fromkeys(found[key].names)
+        if key in recorded:
+            seen |= dict.fromkeys(recorded[key].names)
     if len(seen) > MOST_JOINTS:
         raise DataError(
             f"{session.path.name}: {len(seen)} joints on {response_topic} and {command_topic}; at "
@@ -186,7 +188,7 @@ def read_columns(
         )
     by_name = {
         key: {name: signals.signal(name) for name in signals.names}
-        for key, signals in found.items()
+        for key, signals in recorded.items()
     }
     _leave_out_pauses(by_name, response_topic, session.start_ns, warn)
     absent: dict[str, Signal] = {}
@@ -194,7 +196,7 @@ def read_columns(
         names=tuple(seen) if session.robot is not None else by_number(tuple(seen), warn),
         **{key: by_name.get(key, absent) for key in QUANTITIES},
         powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
-        topics={key: wanted[key][0] for key in found},
+        topics={key: sources[key][0] for key in recorded},
         excitation=by_name.get("excitation", absent),
     )
 
@@ -259,17 +261,17 @@ def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
     return result
 
 
-def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
+def _read(session: SessionView, sources: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
     """All in one pass if all are there; else one by one, leaving out what is empty."""
-    topics: dict[str, list[str]] = {topic: [] for topic, _ in wanted.values()}
-    for topic, kind in dict.fromkeys(wanted.values()):
+    topics: dict[str, list[str]] = {topic: [] for topic, _ in sources.values()}
+    for topic, kind in dict.fromkeys(sources.values()):
         topics[topic].append(kind)
     try:
-        found = session.joint_columns(topics)
-        return {key: found[one] for key, one in wanted.items()}
+        signals = session.joint_columns(topics)
+        return {key: signals[source] for key, source in sources.items()}
     except MissingChannelError:
         some: dict[str, JointSignals] = {}
-        for key, (topic, kind) in wanted.items():
+        for key, (topic, kind) in sources.items():
             try:
                 some[key] = session.joints(topic, kind)
             except MissingChannelError:
@@ -280,7 +282,9 @@ def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[s
 def _check_robots(session: SessionView, topics: JointTopics) -> None:
     """Raise DataError if it isn't known which of several robots is meant."""
     if topics.robots:
-        choices = (f"--command-topic {one} --response-topic {two}" for one, two in topics.robots)
+        choices = (
+            f"--command-topic {first} --response-topic {second}" for first, second in topics.robots
+        )
         raise DataError(
             f"{session.path.name}: {len(topics.robots)} robots with joints of the same names; "
             f"choose one: {', or '.join(choices)}"

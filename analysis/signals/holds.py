@@ -114,18 +114,18 @@ def stale(position: Series) -> tuple[Span, ...]:
         return ()
     travel = np.abs(value[4:] - value[:-4])
     fast = travel > max(0.5 * np.percentile(travel, 95), 2 * RESOLVED * resolution_of(value))
-    of, among = (_around(one) for one in (fast & repeats, fast))
-    known = np.flatnonzero(among >= _FEW)
-    if known.size == 0:
+    of, among = (_around(samples) for samples in (fast & repeats, fast))
+    enough = np.flatnonzero(among >= _FEW)
+    if enough.size == 0:
         return ()
-    old = of[known] > STALE_SHARE * among[known]
+    old = of[enough] > STALE_SHARE * among[enough]
     marked = np.zeros(value.size, dtype=np.bool_)
     for k, stop in zip(*runs(old), strict=True):
-        seen = slice(max(known[k] - _BOX // 2, 0), known[stop - 1] + _BOX // 2 + 1)
+        seen = slice(max(enough[k] - _BOX // 2, 0), enough[stop - 1] + _BOX // 2 + 1)
         again, quick = int((fast & repeats)[seen].sum()), int(fast[seen].sum())
         # A few of the many windows of a noisy coarse encoder exceed the share by chance.
         if bdtrc(again - 1, quick, _BY_CHANCE) < _RARE:
-            marked[known[k] + 2 : known[stop - 1] + 3] = True
+            marked[enough[k] + 2 : enough[stop - 1] + 3] = True
     return spans_of(position.t_s, marked)
 
 
@@ -135,22 +135,22 @@ def _at_reversals(
     """Which holds are rests of a joint with stick or play: usual ones at both reversals."""
     cycles = max(turns(motion).size - 1, 0)
     high = position.values[first] > (position.values.max() + position.values.min()) / 2
-    found = np.zeros(first.size, dtype=np.bool_)
+    rest = np.zeros(first.size, dtype=np.bool_)
     usual: list[float] = []
     for side in (high, ~high):
         rests = side & (travel > _REST_TRAVEL * asked)
         if cycles < _TOPS or np.count_nonzero(rests) < _REST_SHARE * cycles:
-            return found
+            return rest
         usual.append(float(np.median(np.sort(travel[rests])[-cycles:])))
     for side, most in zip((high, ~high), usual, strict=True):
-        found |= side & (travel <= _LIKE_RESTS * most)
-    return found
+        rest |= side & (travel <= _LIKE_RESTS * most)
+    return rest
 
 
 def _gentle(position: Series, motion: Series, first: IntArray, stop: IntArray) -> BoolArray:
     """Which holds begin slowly, end without a jump, and have a reversal of the motion inside."""
     value, t_s = position.values, position.t_s
-    found = np.zeros(first.size, dtype=np.bool_)
+    gentle = np.zeros(first.size, dtype=np.bool_)
     usual = float(np.percentile(np.abs(np.diff(value)), 95))
     for k, (i, j) in enumerate(zip(first.tolist(), stop.tolist(), strict=True)):
         if i < _ENTRY or j > value.size - _ENTRY:
@@ -159,8 +159,8 @@ def _gentle(position: Series, motion: Series, first: IntArray, stop: IntArray) -
         jumped = float(abs(value[j] - value[j - 1]))
         inside = motion.at(t_s[i:j])
         net = float(abs(inside[-1] - inside[0]))
-        found[k] = max(came, jumped) <= _GENTLE * usual and float(np.ptp(inside)) > _TURNS * net
-    return found
+        gentle[k] = max(came, jumped) <= _GENTLE * usual and float(np.ptp(inside)) > _TURNS * net
+    return gentle
 
 
 def clipped(

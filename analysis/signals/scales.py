@@ -181,8 +181,10 @@ def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool =
     x, y = (v - np.repeat(np.add.reduceat(v, starts) / count, count) for v in (x, y))
     xx, yy, xy = (np.add.reduceat(v, starts) for v in (x * x, y * y, x * y))
     usable = (xx > 0) & (yy > 0) & (count > _FEW)
-    for one in (first, second):
-        usable &= _hole(one, first.t_s[starts], stops) <= HOLE_SHARE * (stops - first.t_s[starts])
+    for channel in (first, second):
+        usable &= _hole(channel, first.t_s[starts], stops) <= HOLE_SHARE * (
+            stops - first.t_s[starts]
+        )
     nothing = np.full(starts.size, np.nan)
     ratio = np.sqrt(np.divide(xx, yy, out=nothing.copy(), where=usable))
     correlation = np.divide(xy, np.sqrt(xx * yy), out=nothing, where=usable)
@@ -195,46 +197,46 @@ def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool =
     return Compared(first.t_s[starts], stops, ratio, correlation, error)
 
 
-def against_command(one: Compared, rate: Compared) -> dict[str, tuple[Span, ...]]:
+def against_command(position: Compared, rate: Compared) -> dict[str, tuple[Span, ...]]:
     """Wrong sign and unit of a position, from its command.
 
     Args:
-        one: Position against its command.
+        position: Position against its command.
         rate: Position against the rate of its command.
 
     Returns:
         ``wrong_sign`` and ``wrong_unit`` to stretches, those that were found.
     """
-    degrees = _near(one.ratio, DEGREE) & (np.abs(one.correlation) > -OPPOSITE)
+    degrees = _near(position.ratio, DEGREE) & (np.abs(position.correlation) > -OPPOSITE)
     # A joint that hardly moves may be stuck: only one that follows closely is in another unit.
-    radians = _near(one.ratio, 1 / DEGREE) & (one.correlation > MIN_CORRELATION)
-    full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
-    opposite = (one.correlation < OPPOSITE) & (full | degrees) & (rate.correlation > EARLY)
+    radians = _near(position.ratio, 1 / DEGREE) & (position.correlation > MIN_CORRELATION)
+    full = (position.ratio > FULL_SIZE[0]) & (position.ratio < FULL_SIZE[1])
+    opposite = (position.correlation < OPPOSITE) & (full | degrees) & (rate.correlation > EARLY)
     # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
-    along = np.abs(one.correlation[np.isfinite(one.correlation)]) > -OPPOSITE
+    along = np.abs(position.correlation[np.isfinite(position.correlation)]) > -OPPOSITE
     opposite &= np.count_nonzero(along) >= EITHER_WAY * along.size
-    return _found(one, {"wrong_sign": opposite, "wrong_unit": degrees | radians})
+    return _found(position, {"wrong_sign": opposite, "wrong_unit": degrees | radians})
 
 
-def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
+def against_witness(position: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     """Sign, unit and scale of a position against another measure of the same angle.
 
     Args:
-        one: Position against a second sensor, or against the integral of the velocity.
+        position: Position against a second sensor, or against the integral of the velocity.
         same: Factor within which scales agree.
 
     Returns:
         ``wrong_sign``, ``wrong_unit`` and ``scale_mismatch`` to stretches, those that were found.
     """
-    clear = np.abs(one.correlation) > MIN_CORRELATION
-    ratio = np.where(clear, one.ratio, np.nan)
+    clear = np.abs(position.correlation) > MIN_CORRELATION
+    ratio = np.where(clear, position.ratio, np.nan)
     if clear.any():
         near = np.pad(ratio[clear], 1, mode="edge")
         ratio[clear] = np.median(np.stack([near[:-2], near[1:-1], near[2:]]), axis=0)
     unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
-    off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
-    signs = {"wrong_sign": clear & (one.correlation < 0), "wrong_unit": unit}
-    return _found(one, signs | {"scale_mismatch": clear & off & ~unit})
+    off = np.abs(np.log(ratio)) > np.log(same) + SURE * position.error
+    signs = {"wrong_sign": clear & (position.correlation < 0), "wrong_unit": unit}
+    return _found(position, signs | {"scale_mismatch": clear & off & ~unit})
 
 
 def rate_of(series: Series) -> Series:
@@ -277,5 +279,5 @@ def _near(ratio: FloatArray, factor: float) -> BoolArray:
     return np.abs(np.log(ratio / factor)) < np.log(UNIT_SLACK)
 
 
-def _found(one: Compared, marked: dict[str, BoolArray]) -> dict[str, tuple[Span, ...]]:
-    return {name: one.spans(mask) for name, mask in marked.items() if np.any(mask)}
+def _found(comparison: Compared, marked: dict[str, BoolArray]) -> dict[str, tuple[Span, ...]]:
+    return {name: comparison.spans(mask) for name, mask in marked.items() if np.any(mask)}

@@ -108,20 +108,22 @@ def without_breaks(
     Raises:
         DataError: If there are no samples at all, or commands and responses don't overlap.
     """
-    times = [one.t_ns for kind in (columns.command, columns.position) for one in kind.values()]
+    times = [
+        signal.t_ns for kind in (columns.command, columns.position) for signal in kind.values()
+    ]
     every = longest_unbroken(times)
     if every is None or not every.others:
         return columns, ""
     both = recorded(session, columns, options)
-    found = longest_unbroken(times, both.start_ns, both.stop_ns)
-    if found is None:
+    stretch = longest_unbroken(times, both.start_ns, both.stop_ns)
+    if stretch is None:
         return columns, ""
-    if found.others:
-        warn(str(found))
+    if stretch.others:
+        warn(str(stretch))
     shared: SharedTimes = {}
 
     def parts_of(signals: Mapping[str, Signal]) -> dict[str, Signal]:
-        limits = found.start_ns, found.last_ns + 1
+        limits = stretch.start_ns, stretch.last_ns + 1
         return {name: part_of(signal, *limits, shared) for name, signal in signals.items()}
 
     kept = replace(
@@ -130,7 +132,7 @@ def without_breaks(
         excitation=parts_of(columns.excitation),
         powers={topic: parts_of(signals) for topic, signals in columns.powers.items()},
     )
-    return kept, str(found) if found.others else ""
+    return kept, str(stretch) if stretch.others else ""
 
 
 @dataclass(frozen=True)
@@ -276,10 +278,10 @@ def recorded(session: SessionView, columns: Columns, options: Options) -> Stretc
     """
     kinds = (columns.command, columns.position)
     spans = [covered([signal.t_ns for signal in kind.values()]) for kind in kinds]
-    known = [span for span in spans if span is not None]
-    if not known:
+    covered_spans = [span for span in spans if span is not None]
+    if not covered_spans:
         raise DataError(f"{session.path}: the joint topics hold no samples; nothing to analyse")
-    both = Stretch(max(s.start_ns for s in known), min(s.stop_ns for s in known))
+    both = Stretch(max(s.start_ns for s in covered_spans), min(s.stop_ns for s in covered_spans))
     if both.duration_s <= 0:
         raise DataError(
             f"{session.path}: commands and responses don't overlap in time; their clocks differ"

@@ -154,11 +154,11 @@ def soft_ends(size: FloatArray) -> tuple[int, int]:
         How many quarters of a cycle to leave out at the start and at the end; 0 where the
         amplitude begins, or ends, steady, and where it varies otherwise than by a soft start.
     """
-    known = np.isfinite(size) & (size > 0)
-    if np.count_nonzero(known) < _PARTS * MIN_CYCLES:
+    followed = np.isfinite(size) & (size > 0)
+    if np.count_nonzero(followed) < _PARTS * MIN_CYCLES:
         return 0, 0
-    level = _commonest(size[known])
-    steady = known & (np.abs(np.where(known, size, 0.0) / level - 1) <= STEADY)
+    level = _commonest(size[followed])
+    steady = followed & (np.abs(np.where(followed, size, 0.0) / level - 1) <= STEADY)
     inside = np.flatnonzero(steady)
     first, last = int(inside[0]), int(inside[-1])
     if last - first < _PARTS * (MIN_CYCLES - 1) or steady[first : last + 1].mean() < _LEAST_STEADY:
@@ -333,9 +333,9 @@ def moving(commands: Sequence[Series]) -> tuple[float, float] | None:
     Returns:
         Times [s], or None where no command ever moves.
     """
-    each = [(command.t_s, np.flatnonzero(np.diff(command.values) != 0)) for command in commands]
-    known = [(float(t_s[k[0]]), float(t_s[k[-1] + 1])) for t_s, k in each if k.size]
-    return (min(known)[0], max(stop for _, stop in known)) if known else None
+    changes = [(command.t_s, np.flatnonzero(np.diff(command.values) != 0)) for command in commands]
+    spans = [(float(t_s[k[0]]), float(t_s[k[-1] + 1])) for t_s, k in changes if k.size]
+    return (min(spans)[0], max(stop for _, stop in spans)) if spans else None
 
 
 def whole_cycles(start_s: float, stop_s: float, frequency_hz: float) -> tuple[float, float, int]:

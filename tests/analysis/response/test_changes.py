@@ -237,7 +237,7 @@ def test_a_ringing_body_mode_is_told_from_the_gait():
     low, high = gait.changes.time_constant_s.ci95
     assert low - 0.2 <= 7.5 <= high + 0.2
     assert high - low < 1.0
-    off_hz = gait.changes.found.turn / (2 * np.pi * gait.changes.period_s)
+    off_hz = gait.changes.slow.turn / (2 * np.pi * gait.changes.period_s)
     assert off_hz == pytest.approx(3.46 / (2 * np.pi) - 0.5, abs=0.01)
     lags = [lag_estimate(gait.response, k).ci95 for k in range(8)]
     assert sum(low <= 0.2 <= high for low, high in lags) >= 7
@@ -268,7 +268,7 @@ def test_too_few_independent_cycles_are_named(cycles, correlation, least, most):
         commands, responses, _, duration_s = planted_session(rng, planted, cycles, 2)
         notes = []
         gait = fit_gait(commands, responses, duration_s, notes.append)
-        assert 1.0 <= gait.changes.found.effective <= cycles
+        assert 1.0 <= gait.changes.slow.effective <= cycles
         named = "may be too narrow; record at least"
         warned += any(named in text for text in notes)
     assert least <= warned <= most

@@ -60,7 +60,7 @@ def slow(trend=Trend.STEADY, **fields):
 
 def changes_of(result, **fields):
     given = {
-        "found": result,
+        "slow": result,
         "reference": np.array([0.9 + 0j, 0.5j]),
         "excess": 0.5,
         "period_s": 2.0,
