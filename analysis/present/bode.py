@@ -64,7 +64,7 @@ def best_linear_bode(joints: Sequence[BestLinearJoint], prefix: str) -> list[Dra
     """Draw best linear approximations likewise, with the noise and the distortion of each gain."""
     groups = [joints[k : k + JOINTS] for k in range(0, len(joints), JOINTS)]
     return [
-        _figure([one.response for one in group], f"{prefix}-{k}", group)
+        _figure([joint.response for joint in group], f"{prefix}-{k}", group)
         for k, group in enumerate(groups)
     ]
 
@@ -76,25 +76,25 @@ def _figure(
     tooltips: dict[str, str | Sequence[str]] = {}
     with drawing(4.6) as figure:
         gain_axes, lag_axes = figure.subplots(2, 1, sharex=True)
-        for number, (one, color) in enumerate(zip(group, colors, strict=True)):
-            frequency = np.array(one.frequency_hz)
-            gain, ends = np.array(one.gain), np.array(one.gain_ci95)
+        for number, (response, color) in enumerate(zip(group, colors, strict=True)):
+            frequency = np.array(response.frequency_hz)
+            gain, ends = np.array(response.gain), np.array(response.gain_ci95)
             style = {"color": color, "linewidth": 1.4, "marker": MARKERS[number], "markersize": 3.6}
             gain_axes.plot(frequency, gain, gid=f"gain-{number}", **style)
-            tooltips[f"gain-{number}"] = _tips(one, range(gain.size), lag=False)
+            tooltips[f"gain-{number}"] = _tips(response, range(gain.size), lag=False)
             low = np.maximum(ends[:, 0], gain.min() / 10)  # a logarithm has no zero
             band(gain_axes, frequency, low, ends[:, 1], color=color, alpha=0.18)
-            sure = np.array([interval is not None for interval in one.lag_ci95])
+            sure = np.array([interval is not None for interval in response.lag_ci95])
             if sure.any():
-                lag = _unwrapped(np.array(one.lag_rad)[sure])
-                reach = np.array([_reach(one, k) for k in np.flatnonzero(sure).tolist()])
+                lag = _unwrapped(np.array(response.lag_rad)[sure])
+                reach = np.array([_reach(response, k) for k in np.flatnonzero(sure).tolist()])
                 lag_axes.plot(frequency[sure], np.degrees(lag), gid=f"lag-{number}", **style)
-                tooltips[f"lag-{number}"] = _tips(one, np.flatnonzero(sure).tolist(), lag=True)
+                tooltips[f"lag-{number}"] = _tips(response, np.flatnonzero(sure).tolist(), lag=True)
                 edges = np.degrees(lag - reach), np.degrees(lag + reach)
                 band(lag_axes, frequency[sure], *edges, color=color, alpha=0.18)
-        for one, color in zip(best, colors, strict=False):
-            frequency = np.array(one.response.frequency_hz)
-            for values, line in ((one.distortion_sd, "--"), (one.noise_sd, ":")):
+        for joint, color in zip(best, colors, strict=False):
+            frequency = np.array(joint.response.frequency_hz)
+            for values, line in ((joint.distortion_sd, "--"), (joint.noise_sd, ":")):
                 shown = np.array(values or ()) > 0  # a logarithm has no zero
                 if shown.any():
                     sd = np.array(values)[shown]
@@ -109,12 +109,12 @@ def _figure(
         lag_axes.set_ylabel("lag [°]")
         lag_axes.set_xlabel("frequency [Hz]")
         handles = [
-            key(color=color, linewidth=1.4, marker=each, label=short(one.joint, 14))
-            for one, color, each in zip(group, colors, MARKERS, strict=False)
+            key(color=color, linewidth=1.4, marker=marker, label=short(response.joint, 14))
+            for response, color, marker in zip(group, colors, MARKERS, strict=False)
         ]
         legend(figure, *handles)
         figure.align_ylabels()
-        names = ", ".join(one.joint for one in group)
+        names = ", ".join(response.joint for response in group)
         svg = inline_svg(
             figure, prefix, f"Frequency response of {names}", _bode_in_words(group), tooltips
         )
@@ -150,10 +150,10 @@ def _unwrapped(lag_rad: FloatArray) -> FloatArray:
 
 def _bode_in_words(group: Sequence[JointFrequencyResponse]) -> str:
     return "; ".join(
-        f"{one.joint}: gain {one.gain[0]:.3g} at {one.frequency_hz[0]:.3g} Hz and "
-        f"{one.gain[-1]:.3g} at {one.frequency_hz[-1]:.3g} Hz, lag "
-        f"{math.degrees(one.lag_rad[0]):.3g}° and {math.degrees(one.lag_rad[-1]):.3g}°"
-        for one in group
+        f"{response.joint}: gain {response.gain[0]:.3g} at {response.frequency_hz[0]:.3g} Hz and "
+        f"{response.gain[-1]:.3g} at {response.frequency_hz[-1]:.3g} Hz, lag "
+        f"{math.degrees(response.lag_rad[0]):.3g}° and {math.degrees(response.lag_rad[-1]):.3g}°"
+        for response in group
     )
 
 
@@ -198,8 +198,8 @@ def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
     drawings: list[Drawing] = []
     for title, names, value, signed, least in shown:
         if np.isfinite(value).any():
-            one = Map(title, names, *_thinned(cycles, value), signed, least)
-            drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
+            chart = Map(title, names, *_thinned(cycles, value), signed, least)
+            drawings.append(_draw(chart, f"{prefix}-{len(drawings)}", _caption(cycles, chart)))
     return tuple(drawings)
 
 
@@ -207,9 +207,9 @@ def _thinned(cycles: CycleMaps, value: FloatArray) -> tuple[FloatArray, BoolArra
     """Return means over as few cycles as fit into the map's columns."""
     count = cycles.start_s.size
     first = np.arange(0, count, -(-count // MOST_COLUMNS))
-    known = np.isfinite(value)
-    total = np.add.reduceat(np.where(known, value, 0.0), first, axis=1)
-    seen = np.add.reduceat(known.astype(np.float64), first, axis=1)
+    finite = np.isfinite(value)
+    total = np.add.reduceat(np.where(finite, value, 0.0), first, axis=1)
+    seen = np.add.reduceat(finite.astype(np.float64), first, axis=1)
     mean = np.divide(total, seen, out=np.full_like(total, np.nan), where=seen > 0)
     width = np.diff(np.append(first, count))
     end_s = cycles.start_s[-1] + cycles.period_s

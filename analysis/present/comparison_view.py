@@ -125,24 +125,24 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
         prefix: For identifiers, unique in the page.
     """
     every = joint_hex(len(comparison.waveforms))
-    worst = sorted(comparison.waveforms, key=lambda one: -one.rms_rad)[:_MOST_WAVES]
+    worst = sorted(comparison.waveforms, key=lambda waveform: -waveform.rms_rad)[:_MOST_WAVES]
     pairs = zip(comparison.waveforms, every, strict=True)
-    shown = [(one, color) for one, color in pairs if one in worst]
+    shown = [(waveform, color) for waveform, color in pairs if waveform in worst]
     phases = np.degrees(comparison.phase_rad)
     phase = "gait phase" if comparison.commanded else "phase"
     tooltips: dict[str, str] = {}
     with drawing(0.8 + 1.4 * len(shown)) as figure:
         grid = figure.subplots(len(shown), 2, sharex=True, squeeze=False)
-        for k, ((both, right), (one, color)) in enumerate(zip(grid, shown, strict=True)):
-            both.plot(phases, np.degrees(one.a_rad), gid=f"a-{k}", **COMMAND)
-            both.plot(phases, np.degrees(one.b_rad), color=color, gid=f"b-{k}")
-            both.set_title(short(one.name))
-            middle, half = np.degrees(one.difference_rad), np.degrees(one.half_rad)
+        for k, ((both, right), (waveform, color)) in enumerate(zip(grid, shown, strict=True)):
+            both.plot(phases, np.degrees(waveform.a_rad), gid=f"a-{k}", **COMMAND)
+            both.plot(phases, np.degrees(waveform.b_rad), color=color, gid=f"b-{k}")
+            both.set_title(short(waveform.name))
+            middle, half = np.degrees(waveform.difference_rad), np.degrees(waveform.half_rad)
             right.axhline(0.0, color=REFERENCE, linestyle=DASHED, linewidth=0.8)
             band(right, phases, middle - half, middle + half, color=color, alpha=0.25)
             right.plot(phases, middle, color=color, gid=f"difference-{k}")
             names = {"a": "A", "b": "B", "difference": "B − A"}
-            tooltips |= {f"{which}-{k}": f"{one.name} {name}" for which, name in names.items()}
+            tooltips |= {f"{which}-{k}": f"{waveform.name} {name}" for which, name in names.items()}
             right.set_title("B − A")
         grid[-1, 0].set_xticks(range(0, 361, 90))
         for axes in grid[-1]:
@@ -155,7 +155,7 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
             key(color=color, label="B"),
             key(color=color, linewidth=6, alpha=0.25, label="95 %, each phase"),
         )
-        description = "Joints: " + ", ".join(short(one.name) for one, _ in shown) + "."
+        description = "Joints: " + ", ".join(short(waveform.name) for waveform, _ in shown) + "."
         svg = inline_svg(figure, prefix, f"Mean cycles by {phase}", description, tooltips)
     by = "commands" if comparison.commanded else "first joint's own motion"
     return Drawing(
@@ -175,7 +175,7 @@ def comparison_view(comparison: Comparison) -> dict[str, Any]:
         "sentence": comparison.answer,
         "sides": [(letter, session) for letter, sessions in sides for session in sessions],
         "facts": _facts(comparison),
-        "marks": [joint_mark(colors[one.name], "horizontal") for one in comparison.named],
+        "marks": [joint_mark(colors[joint.name], "horizontal") for joint in comparison.named],
         "differences": differences_of(comparison, "differences") if names else None,
         "waveforms": waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
         "trials": _trials(comparison),
@@ -204,11 +204,11 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
         prefix: For identifiers, unique in the page.
     """
     names = joints_of(comparison)
-    known = {
+    differences = {
         (difference.quantity, difference.place): difference.difference
         for difference in comparison.differences
     }
-    margins = {one.quantity: one.margin for one in comparison.equivalence}
+    margins = {test.quantity: test.margin for test in comparison.equivalence}
     panels: list[Panel] = []
     for quantity, label, factor in (
         ("gain", "gain [%]", 100.0),
@@ -220,7 +220,9 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
         ("energy_abs", "E_abs [mJ a cycle]", 1000.0),
     ):
         if quantity in margins:
-            values = [scaled(known.get((quantity, name), Estimate()), factor) for name in names]
+            values = [
+                scaled(differences.get((quantity, name), Estimate()), factor) for name in names
+            ]
             panels.append(Panel(label, values, factor * margins[quantity]))
     return differences_drawing(names, panels, title="B minus A of every joint", prefix=prefix)
 
@@ -228,19 +230,19 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
 def _trials(comparison: Comparison) -> list[Trial]:
     return [
         Trial(
-            f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_text(one)}?",
-            f"largest difference {margin_text(one, one.largest)}",
-            one.p,
-            "yes, shown to be the same" if one.p < SIGNIFICANT_DIFFERENCE else "not shown",
+            f"Is the {WORDS[test.quantity]} the same on both sides, within {margin_text(test)}?",
+            f"largest difference {margin_text(test, test.largest)}",
+            test.p,
+            "yes, shown to be the same" if test.p < SIGNIFICANT_DIFFERENCE else "not shown",
         )
-        for one in comparison.equivalence
+        for test in comparison.equivalence
     ]
 
 
 def _facts(comparison: Comparison) -> list[Fact]:
     a, b = len(comparison.a), len(comparison.b)
     joints = len(joints_of(comparison))
-    compared = {one.quantity for one in comparison.differences}
+    compared = {difference.quantity for difference in comparison.differences}
     quantities = [quantity for quantity in RESPONSE if quantity in compared]
     quantities = [quantity for quantity in quantities if quantity != "rest_amplitude"]
     responses = " or ".join(dict.fromkeys(WORDS[quantity] for quantity in quantities))
@@ -251,9 +253,11 @@ def _facts(comparison: Comparison) -> list[Fact]:
         Fact("Joints that differ", f"{len(comparison.named)} of {joints}", f"in {responses}"),
     ]
     for quantity in quantities:
-        of = [one for one in comparison.differences if one.quantity == quantity]
+        of = [
+            difference for difference in comparison.differences if difference.quantity == quantity
+        ]
         if of:
-            worst = max(of, key=lambda one: one.size)
+            worst = max(of, key=lambda difference: difference.size)
             text = signed_difference(worst)
             facts.append(Fact(f"Largest in {WORDS[quantity]}", text, f"B minus A, {worst.place}"))
     for difference in comparison.differences:
@@ -351,23 +355,23 @@ def _change_drawing(
     column = (columns | {"gain": "gain", "delay": "tracking_lag_s"})[change.quantity]
     table: Any = joints
     named = (table["robot"] == history.robot) & (table["serial"].fillna("") == history.serial)
-    own = table[named & table["joint"].isin(history.joints)]
-    if change.quantity == "gain" and "tracking_gain" in own:
-        own = own.assign(gain=own["gain"].fillna(own["tracking_gain"]))
-    own = own.dropna(subset=[column]).sort_values("start")
+    frame = table[named & table["joint"].isin(history.joints)]
+    if change.quantity == "gain" and "tracking_gain" in frame:
+        frame = frame.assign(gain=frame["gain"].fillna(frame["tracking_gain"]))
+    frame = frame.dropna(subset=[column]).sort_values("start")
     degrees = change.quantity in ("lag", "offset")
-    values = own[column].map(math.degrees) if degrees else own[column]
+    values = frame[column].map(math.degrees) if degrees else frame[column]
     if change.quantity == "energy":
-        values /= own["stop_s"] - own["start_s"]
+        values /= frame["stop_s"] - frame["start_s"]
     colors = dict(zip(history.joints, joint_hex(len(history.joints)), strict=True))
     tooltips: dict[str, str | Sequence[str]] = {}
     with drawing(2.4) as figure:
         axes: Axes = figure.subplots()
         for name in history.joints:
-            rows = own["joint"] == name
+            rows = frame["joint"] == name
             mine = name == change.joint
             axes.plot(
-                own["start"][rows].to_numpy(),
+                frame["start"][rows].to_numpy(),
                 values[rows].to_numpy(),
                 color=colors[name] if mine else REFERENCE,
                 marker="o" if mine else None,
@@ -377,7 +381,7 @@ def _change_drawing(
                 gid="changed" if mine else None,
             )
             if mine:
-                points = zip(own["start"][rows], values[rows], own["path"][rows], strict=True)
+                points = zip(frame["start"][rows], values[rows], frame["path"][rows], strict=True)
                 texts = [f"{name}: {v:.4g} on {str(t)[:10]}, {path}" for t, v, path in points]
                 tooltips["changed"] = texts
         axes.axvspan(

@@ -63,11 +63,11 @@ def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.Dat
     return frame
 
 
-def row_of(one: Any) -> dict[str, Any]:
+def row_of(record: Any) -> dict[str, Any]:
     """Return a dataclass as a row."""
     row: dict[str, Any] = {}
-    for field in fields(one):
-        value = getattr(one, field.name)
+    for field in fields(record):
+        value = getattr(record, field.name)
         if value is None and "float" in str(field.type):
             value = float("nan")
         row |= _cells(field.name, value)
@@ -266,20 +266,20 @@ def _oscillators(chains: Sequence[ChainCoupling]) -> Frames:
     """Return couplings and rates of all chains; no tables without logged phases."""
     if not chains:
         return {}
-    found = {
+    frames = {
         "oscillators": table(
             Link,
-            [link for one in chains for link in one.links],
-            plane=[one.plane for one in chains for _ in one.links],
+            [link for coupling in chains for link in coupling.links],
+            plane=[coupling.plane for coupling in chains for _ in coupling.links],
         ),
         "oscillator_rates": table(
             Rate,
-            [rate for one in chains for rate in one.oscillators],
-            plane=[one.plane for one in chains for _ in one.oscillators],
+            [rate for coupling in chains for rate in coupling.oscillators],
+            plane=[coupling.plane for coupling in chains for _ in coupling.oscillators],
         ),
         "chains": table(ChainCoupling, chains),
     }
-    return {name: frame.rename(columns=_with_unit) for name, frame in found.items()}
+    return {name: frame.rename(columns=_with_unit) for name, frame in frames.items()}
 
 
 def _with_unit(column: str) -> str:
@@ -305,12 +305,12 @@ def joint_table(sessions: Sequence[Analysis]) -> pd.DataFrame:
         stop and number of cycles of the windows that the joint's numbers are of.
     """
     owners = [(session, joint) for session in sessions for joint in session.joints]
-    windows = [_windows(one.gait, joint) for one, joint in owners]
+    windows = [_windows(session.gait, joint) for session, joint in owners]
     frame = table(
         JointResult,
         [joint for _, joint in owners],
-        session=[one.session.id for one, _ in owners],
-        path=[one.session.path for one, _ in owners],
+        session=[session.session.id for session, _ in owners],
+        path=[session.session.path for session, _ in owners],
         start_s=[window[0] for window in windows],
         stop_s=[window[1] for window in windows],
         cycles=[window[2] for window in windows],

@@ -109,10 +109,10 @@ def _sweep_trials(coupling: LinearCoupling) -> list[Trial]:
 
 def _linear(coupling: LinearCoupling) -> Trial:
     question = f"Is the chain linear for these motions, within {100 * NONLINEAR:g} %?"
-    known = [tone.distortion for tone in coupling.tones if tone.distortion is not None]
-    if not known:
+    distortions = [tone.distortion for tone in coupling.tones if tone.distortion is not None]
+    if not distortions:
         return Trial(question, "records too short for lines beside the tones", None, "open")
-    worst = max(known)
+    worst = max(distortions)
     verdict = "yes" if worst <= NONLINEAR else "no: take a smaller amplitude"
     return Trial(question, f"largest distortion {digits(100 * worst)} %", None, verdict)
 
@@ -123,8 +123,8 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
     best, connection = experiment.best_linear, experiment.body_connection
     connection = connection if connection is not None and connection.fitted else None
     joints = [joint for session in experiment.sessions for joint in session.joints]
-    known = {joint.name for joint in joints if joint.gain.value is not None}
-    names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
+    answered = {joint.name for joint in joints if joint.gain.value is not None}
+    names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in answered)
     entries = entries_of(coupling, names)
     trials = experiment_trials(experiment)
     if isinstance(coupling, LinearCoupling):
@@ -150,7 +150,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "checks": _checks(coupling),
         "travel": None if connection is None else travel_table(connection),
         "travel_figure": None
-        if connection is None or all(one.why for one in connection.predicted)
+        if connection is None or all(travel.why for travel in connection.predicted)
         else travel_drawing(connection),
         "travel_detail": [] if connection is None else connection_detail(connection),
         "travel_refusals": [] if connection is None else list(refusals(connection)),
@@ -158,7 +158,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),
         "trials": trials,
-        "indices": any(one.value is not None for one in experiment.heterogeneity.values()),
+        "indices": any(index.value is not None for index in experiment.heterogeneity.values()),
         "shared": _alike(by_sentence(experiment, "warnings")),
         "notes": [f"{note} ({files})" for note, files in _alike(by_sentence(experiment, "notes"))],
         "flagged": _flagged(experiment),
@@ -204,11 +204,11 @@ def _tables(experiment: Experiment, names: Sequence[str]) -> list[dict[str, Any]
 
 def _alike(warnings: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Return one warning of those that differ in their numbers only."""
-    found: dict[str, list[tuple[str, str]]] = {}
+    groups: dict[str, list[tuple[str, str]]] = {}
     for warning, files in warnings:
-        found.setdefault(_NUMBERS.sub("#", warning), []).append((warning, files))
+        groups.setdefault(_NUMBERS.sub("#", warning), []).append((warning, files))
     result: list[tuple[str, str]] = []
-    for (first, files), *more in found.values():
+    for (first, files), *more in groups.values():
         times = "once" if len(more) == 1 else f"{len(more)} times"
         rest = f"; alike, with other numbers, {times} more" if more else ""
         result.append((first, files + rest))
@@ -306,7 +306,9 @@ def profiles(experiment: Experiment, reversal: Reversal) -> Profiles:
 
     (gain, lag), (back_gain, back_lag) = of("forward"), of("reverse")
     middle = np.angle(np.nanmean(np.exp(1j * lag)))
-    lag, back_lag = (middle + np.angle(np.exp(1j * (one - middle))) for one in (lag, back_lag))
+    lag, back_lag = (
+        middle + np.angle(np.exp(1j * (angles - middle))) for angles in (lag, back_lag)
+    )
     parts = (gain, np.degrees(lag), back_gain[:, ::-1], np.degrees(back_lag)[:, ::-1])
     return Profiles(*map(frozen, parts))
 
@@ -353,14 +355,14 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
     )
 
 
-def _profile(axes: Axes, one: FloatArray, other: FloatArray, colors: Sequence[str]) -> None:
-    place: FloatArray = np.arange(1.0, one.shape[1] + 1.0)
-    for runs, aside in ((one, -_ASIDE), (other, _ASIDE)):
+def _profile(axes: Axes, forward: FloatArray, other: FloatArray, colors: Sequence[str]) -> None:
+    place: FloatArray = np.arange(1.0, forward.shape[1] + 1.0)
+    for runs, aside in ((forward, -_ASIDE), (other, _ASIDE)):
         for run in runs:
             axes.plot(place + aside, run, ".", color=MUTED, markersize=2.2, zorder=2)
     axes.plot(place, other.mean(0), linewidth=1.0, **_MIRRORED)
-    axes.plot(place, one.mean(0), color=MUTED, linewidth=1.0, zorder=1)
-    for x, y, color in zip(place, one.mean(0), colors, strict=True):
+    axes.plot(place, forward.mean(0), color=MUTED, linewidth=1.0, zorder=1)
+    for x, y, color in zip(place, forward.mean(0), colors, strict=True):
         axes.plot([x], [y], "o", markerfacecolor=color, **_SOLID, zorder=3)
     # Hollow and larger, so that a diamond on a dot shows both.
     axes.plot(place, other.mean(0), "D", **_HOLLOW, zorder=4)
@@ -416,14 +418,14 @@ def travel_drawing(connection: BodyConnection) -> Drawing:
         ("left", " mm", 1000.0, "left_m"),
         ("turn", "°", math.degrees(1.0), "turn_rad"),
     )
-    known = [one for one in connection.predicted if one.why is None]
+    travels = [travel for travel in connection.predicted if travel.why is None]
     tooltips: dict[str, str] = {}
     with drawing(2.7) as figure:
         for axes, (name, unit, scale, field) in zip(figure.subplots(1, 3), panels, strict=True):
             axes.axhline(0.0, color=REFERENCE, linestyle=DASHED, zorder=1)
-            for k, one in enumerate(known):
-                measured = formats.scaled(getattr(one, f"measured_{field}"), scale)
-                predicted = formats.scaled(getattr(one, field), scale)
+            for k, travel in enumerate(travels):
+                measured = formats.scaled(getattr(travel, f"measured_{field}"), scale)
+                predicted = formats.scaled(getattr(travel, field), scale)
                 if measured.value is None or predicted.value is None:
                     continue
                 low, high = predicted.ci95 or (math.nan, math.nan)
@@ -432,14 +434,14 @@ def travel_drawing(connection: BodyConnection) -> Drawing:
                 plot_estimate(axes, seen, off, INK, gid=f"{name}-{k}")
                 shown = formats.number(seen, formats.decimals_for([predicted]))
                 tooltips[f"{name}-{k}"] = (
-                    f"{formats.filename(one.path)}: {name} predicted {estimate(predicted, unit)}, "
-                    f"measured {shown}{unit}"
+                    f"{formats.filename(travel.path)}: {name} predicted "
+                    f"{estimate(predicted, unit)}, measured {shown}{unit}"
                 )
             axes.set_xlabel(f"measured {name} [{unit.strip()}]")
             axes.set_ylabel(f"predicted \N{MINUS SIGN} measured [{unit.strip()}]")
             axes.margins(0.12)
         title = "Travel of a cycle, predicted from the other sessions, against the measured one"
-        described = f"{len(known)} sessions; the table below holds every number."
+        described = f"{len(travels)} sessions; the table below holds every number."
         svg = inline_svg(figure, "travel-figure", title, described, tooltips)
     return Drawing(
         svg,

@@ -106,7 +106,7 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
     """
     if isinstance(coupling, LocalCoupling):
         amplitude = "log amplitude"
-        found = (
+        matrices = (
             ("P", "phase", "phase", coupling.P),
             ("R", amplitude, "phase", coupling.R),
             ("G", amplitude, amplitude, coupling.G),
@@ -114,9 +114,9 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
         )
         words = "{} of the response over {} of the command".format
         return tuple(
-            _entries(symbol, words(what, of), coupling.joints, one.value, one.ci95_half)
-            for symbol, what, of, one in found
-            if one is not None
+            _entries(symbol, words(what, of), coupling.joints, matrix.value, matrix.ci95_half)
+            for symbol, what, of, matrix in matrices
+            if matrix is not None
         )
     if isinstance(coupling, LinearCoupling):
         return _sweep(coupling)

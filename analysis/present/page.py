@@ -412,8 +412,8 @@ def _run(command: list[str], messages: Path, longest_s: float) -> None:
 
 def _failure(browser: str, why: str, messages: Path) -> UndulogError:
     lines = messages.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    said = f"; its last message: {lines[-1]}" if lines else ""
+    detail = f"; its last message: {lines[-1]}" if lines else ""
     return UndulogError(
-        f"{browser} {why}{said}; name another browser by --browser, or write the page with "
+        f"{browser} {why}{detail}; name another browser by --browser, or write the page with "
         "-o PAGE.html and print it by hand"
     )

@@ -130,8 +130,8 @@ def _value(value: object) -> str:
 
 def typeset(text: str) -> str:
     """Return text without line breaks between numbers and units, and with ``H^-1`` raised."""
-    known = _UNIT.sub(NO_BREAK, plain(text).replace("^-1", _INVERSE))
-    return _P.sub(rf"p{NO_BREAK}\1{NO_BREAK}", known)
+    spaced = _UNIT.sub(NO_BREAK, plain(text).replace("^-1", _INVERSE))
+    return _P.sub(rf"p{NO_BREAK}\1{NO_BREAK}", spaced)
 
 
 def sentence(text: str) -> str:
@@ -310,17 +310,17 @@ class Trial:
 
 def session_trials(indices: Mapping[str, Index]) -> list[Trial]:
     """Return the tests of one session, plane by plane."""
-    found = [
+    trials = [
         _common(index, _of(plane)) for plane, index in find(indices, "common_response").items()
     ]
     for quantity in ("gain", "lag"):
         for plane, index in find(indices, f"boundary_contrast_{quantity}").items():
-            found.append(_contrast(index, quantity, _of(plane)))
+            trials.append(_contrast(index, quantity, _of(plane)))
     for quantity in ("gain", "lag"):
         for plane, index in find(indices, f"equivalence_{quantity}").items():
             question = f"within {_MARGINS[quantity]} of the mean of {_of(plane)}?"
-            found.append(_equivalence(index, quantity, f"Is every {quantity} {question}"))
-    return found
+            trials.append(_equivalence(index, quantity, f"Is every {quantity} {question}"))
+    return trials
 
 
 def experiment_trials(experiment: Experiment) -> list[Trial]:
@@ -352,7 +352,9 @@ def _kicks(coupling: LocalCoupling) -> Iterable[Trial]:
             "a deviation could not be shown" if linear else "no: H is descriptive only",
         )
     if coupling.held_out:
-        good = sum(2 * one.error <= one.error_kept for one in coupling.held_out)
+        good = sum(
+            2 * prediction.error <= prediction.error_kept for prediction in coupling.held_out
+        )
         reach = coupling.valid_to
         yield Trial(
             "Do the matrices predict gaits that were not used?",

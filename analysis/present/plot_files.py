@@ -102,7 +102,7 @@ def save_plots(
         OutputExistsError: If a file is there and ``force`` is not given; none is written then.
         LogWriteError: If one can't be written.
     """
-    known = {prefix.removesuffix("-figure"): figure for prefix, figure in drawn.items()}
+    named = {prefix.removesuffix("-figure"): figure for prefix, figure in drawn.items()}
     figures = figures_of(page)
     folder.mkdir(exist_ok=True)
     paths = {name: folder / f"{name}.{kind}" for name in figures}
@@ -115,7 +115,7 @@ def save_plots(
         nothing = {"Software": None} if kind == "png" else {"CreationDate": None}
         style = STYLE | {k: _on_paper(v) for k, v in STYLE.items() if isinstance(v, str)}
         with part_file(paths[name]) as part, _MPL.rc_context(style):  # of ticks that are added
-            figure = recolored(known[name]) if name in known else figure_of(svg)
+            figure = recolored(named[name]) if name in named else figure_of(svg)
             FigureCanvasAgg(figure)
             paper = paper_colors()["paper"]
             figure.savefig(part, format=kind, dpi=_DPI, facecolor=paper, metadata=nothing)
@@ -130,7 +130,9 @@ def _on_paper(color: str) -> str:
 
 def recolored(figure: Figure) -> Figure:
     """Replace the page's variables by the colours of paper, in place, and return the figure."""
-    known = {_COLORS.to_rgb(each): _COLORS.to_rgb(_on_paper(each)) for each in CSS_VARIABLES}
+    paper = {
+        _COLORS.to_rgb(variable): _COLORS.to_rgb(_on_paper(variable)) for variable in CSS_VARIABLES
+    }
     for artist in figure.findobj():
         for name in _PROPERTIES:
             read = getattr(artist, f"get_{name}", None)
@@ -141,7 +143,7 @@ def recolored(figure: Figure) -> Figure:
             if isinstance(now, str) and now in {"none", "auto"}:
                 continue
             rgba = np.atleast_2d(_COLORS.to_rgba_array(now))
-            new = np.array([(*known.get(tuple(c[:3]), tuple(c[:3])), c[3]) for c in rgba.tolist()])
+            new = np.array([(*paper.get(tuple(c[:3]), tuple(c[:3])), c[3]) for c in rgba.tolist()])
             if new.size and not np.array_equal(new, rgba):
                 write(tuple(new[0]) if len(new) == 1 else new)
     return figure
@@ -169,12 +171,12 @@ def _classes(element: ET.Element) -> list[str]:
 def _shown(element: ET.Element, around: frozenset[str]) -> Iterator[tuple[ET.Element, list[str]]]:
     """Yield the visible shapes and texts, as the page's style has them."""
     for child in element:
-        own = _classes(child)
+        classes = _classes(child)
         hidden = {"half", "no"} if "numbers" in around else {"half", "no", "value"}
         if child.tag == "g":
-            yield from _shown(child, around | {*own})
-        elif child.tag in {"rect", "path", "line", "text"} and not hidden & {*own}:
-            yield child, own
+            yield from _shown(child, around | {*classes})
+        elif child.tag in {"rect", "path", "line", "text"} and not hidden & {*classes}:
+            yield child, classes
 
 
 def _draw(axes: Axes, element: ET.Element, classes: list[str], kind: frozenset[str]) -> None:
@@ -247,10 +249,10 @@ def _mixed(color: str, other: str, share: float) -> Any:
     """Return ``color-mix(in oklab, color share, other)``."""
     linear = [
         np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-        for rgb in (np.array(_COLORS.to_rgb(each)) for each in (color, other))
+        for rgb in (np.array(_COLORS.to_rgb(shade)) for shade in (color, other))
     ]
-    one, two = (_TO_LAB @ np.cbrt(_TO_LMS @ each) for each in linear)
-    lab = share * one + (1 - share) * two
+    first, second = (_TO_LAB @ np.cbrt(_TO_LMS @ channels) for channels in linear)
+    lab = share * first + (1 - share) * second
     rgb = np.linalg.solve(_TO_LMS, np.linalg.solve(_TO_LAB, lab) ** 3)
     rgb = np.clip(rgb, 0.0, 1.0)
     return np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)

@@ -46,14 +46,17 @@ def frequency_table(responses: Sequence[JointFrequencyResponse]) -> Table[JointF
         return scaled(Estimate(response.distortion), 100.0)
 
     columns: list[Column[JointFrequencyResponse]] = [
-        Column("joint", "joint", lambda one: one.joint, kind="word"),
+        Column("joint", "joint", lambda response: response.joint, kind="word"),
         Column("command", "command", excitation, kind="word", spare=2),
-        Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
-        Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
+        Column("from Hz", "from [Hz]", lambda response: response.frequency_hz[0], (3, 4)),
+        Column("to Hz", "to [Hz]", lambda response: response.frequency_hz[-1], (2, 3)),
         Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, typical(4, 4)),
-        Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
+        Column("-3 dB Hz", "-3 dB [Hz]", lambda response: Estimate(response.bandwidth_hz), (2, 3)),
         Column(
-            "delay ms (95 %)", "delay [ms]", lambda one: scaled(one.delay_s, 1e3), typical(2, 3)
+            "delay ms (95 %)",
+            "delay [ms]",
+            lambda response: scaled(response.delay_s, 1e3),
+            typical(2, 3),
         ),
         Column("is", "delay is", model, kind="word", spare=4),
         Column("distortion %", "distortion [%]", distortion, (2, 2), spare=3),
@@ -150,14 +153,29 @@ def _ends(estimates: Sequence[Estimate], decimals: int) -> Ends | None:
 
 def motion_table(motions: Sequence[JointMotion]) -> Table[JointMotion]:
     """Return amplitude, offset and lag of joints that move without commands."""
-    with_planes = any(one.plane for one in motions)
+    with_planes = any(motion.plane for motion in motions)
     angle, lag = typical(2, 4), "lag behind the one before"
     columns: list[Column[JointMotion]] = [
-        Column("joint", "joint", lambda one: one.name, kind="word"),
-        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
-        Column("amplitude° (95 %)", "amplitude [°]", lambda one: degrees(one.amplitude_rad), angle),
-        Column("offset° (95 %)", "offset [°]", lambda one: degrees(one.offset_rad), angle, spare=1),
-        Column(f"{lag}° (95 %)", f"{lag} [°]", lambda one: degrees(one.lag_rad), angle),
+        Column("joint", "joint", lambda motion: motion.name, kind="word"),
+        *(
+            [Column("plane", "plane", lambda motion: motion.plane, kind="word")]
+            if with_planes
+            else []
+        ),
+        Column(
+            "amplitude° (95 %)",
+            "amplitude [°]",
+            lambda motion: degrees(motion.amplitude_rad),
+            angle,
+        ),
+        Column(
+            "offset° (95 %)",
+            "offset [°]",
+            lambda motion: degrees(motion.offset_rad),
+            angle,
+            spare=1,
+        ),
+        Column(f"{lag}° (95 %)", f"{lag} [°]", lambda motion: degrees(motion.lag_rad), angle),
     ]
     return Table(columns, motions)
 
@@ -193,19 +211,19 @@ def wave_table(waves: Sequence[BodyWave]) -> Table[BodyWave]:
     def off(wave: BodyWave) -> float:
         return math.degrees(wave.deviation_rad)
 
-    with_planes = any(one.plane for one in waves)
+    with_planes = any(wave.plane for wave in waves)
     angle, share = typical(2, 4), typical(3, 4)
     columns: list[Column[BodyWave]] = [
-        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
+        *([Column("plane", "plane", lambda wave: wave.plane, kind="word")] if with_planes else []),
         Column("wave", "wave", way, kind="word"),
         Column(
-            "°/joint (95 %)", "wave number [°/joint]", lambda one: degrees(one.wave_number), angle
+            "°/joint (95 %)", "wave number [°/joint]", lambda wave: degrees(wave.wave_number), angle
         ),
-        Column("waves (95 %)", "waves", lambda one: one.waves, share),
-        Column("joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, typical(2, 3)),
-        Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, share, spare=1),
+        Column("waves (95 %)", "waves", lambda wave: wave.waves, share),
+        Column("joints/s (95 %)", "speed [joints/s]", lambda wave: wave.speed, typical(2, 3)),
+        Column("m/s", "speed [m/s]", lambda wave: wave.speed_m_s, share, spare=1),
         Column(
-            "travelling (95 %)", "travelling index [1]", lambda one: one.travelling_index, share
+            "travelling (95 %)", "travelling index [1]", lambda wave: wave.travelling_index, share
         ),
         Column("off the line°", "off the line [°]", off, (1, 2), spare=2),
     ]

@@ -104,8 +104,8 @@ def load(path: Path | str) -> PresentedResult:
                 return cast("PresentedResult", _build(kind, data))
             except (KeyError, OverflowError, TypeError, ValueError) as error:
                 raise DataError(f"{path}: a damaged {kind.__name__}: {error!r}") from error
-    known = ", ".join(kind.__name__ for kind in _KINDS)
-    raise DataError(f"{path}: holds no result; known are {known}")
+    kinds = ", ".join(kind.__name__ for kind in _KINDS)
+    raise DataError(f"{path}: holds no result; known are {kinds}")
 
 
 def _required(kind: type[Any]) -> set[str]:
@@ -131,12 +131,12 @@ def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a 
         _require(list if origin is tuple else dict, kind, value)
     if origin is tuple:
         if arguments[-1] is Ellipsis:
-            return tuple(_build(arguments[0], one) for one in value)
+            return tuple(_build(arguments[0], part) for part in value)
         return tuple(
             _build(argument, part) for argument, part in zip(arguments, value, strict=True)
         )
     if origin is dict:
-        return {key: _build(arguments[1], one) for key, one in value.items()}
+        return {key: _build(arguments[1], part) for key, part in value.items()}
     return _dataclass(kind, value) if dataclasses.is_dataclass(kind) else _plain(kind, value)
 
 
@@ -148,17 +148,21 @@ def _require(container: type, kind: Any, value: object) -> None:
 def _plain(kind: type[Any], value: Any) -> Any:
     if issubclass(kind, Enum):
         return kind(value)
-    wanted = (int, float) if kind is float else kind
+    accepted = (int, float) if kind is float else kind
     wrong = isinstance(value, bool) and kind is not bool
-    if wrong or not isinstance(value, wanted) or (kind is float and not math.isfinite(value)):
+    if wrong or not isinstance(value, accepted) or (kind is float and not math.isfinite(value)):
         raise TypeError(f"{value!r:.40} where {kind.__name__} is expected")
     return float(value) if kind is float else value
 
 
 def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
     """Build the matching kind with the most fields."""
-    fitting = [one for one in (kind, *kind.__subclasses__()) if _required(one) <= set(data)]
-    chosen = max(fitting, key=lambda one: len(dataclasses.fields(one)), default=kind)
+    fitting = [
+        candidate
+        for candidate in (kind, *kind.__subclasses__())
+        if _required(candidate) <= set(data)
+    ]
+    chosen = max(fitting, key=lambda candidate: len(dataclasses.fields(candidate)), default=kind)
     hints = get_type_hints(chosen, localns=_NAMES)
     built: dict[str, Any] = {}
     for field in dataclasses.fields(chosen):
@@ -340,11 +344,13 @@ def picture(result: object, what: str | None = None) -> Picture:
         MissingExtraError: If matplotlib is not installed.
     """
     try:
-        known = pictures_of(result)
-        name = next(iter(known)) if what is None else what
-        if name not in known:
-            raise UsageError(f"there is no picture {name!r} of it; there are: {', '.join(known)}")
-        drawing = known[name](f"figure{next(_number)}")
+        pictures = pictures_of(result)
+        name = next(iter(pictures)) if what is None else what
+        if name not in pictures:
+            raise UsageError(
+                f"there is no picture {name!r} of it; there are: {', '.join(pictures)}"
+            )
+        drawing = pictures[name](f"figure{next(_number)}")
     except ImportError as error:
         raise MissingExtraError("plot()", "report", "matplotlib") from error
     return Picture(drawing.svg, drawing.caption)
@@ -376,7 +382,10 @@ def pictures_of(result: object) -> Pictures:
         case Coupling():
             from .matrix import entries_of, matrix_picture
 
-            return {one.symbol: partial(matrix_picture, one) for one in entries_of(result, ())}
+            return {
+                entries.symbol: partial(matrix_picture, entries)
+                for entries in entries_of(result, ())
+            }
         case _:
             raise UsageError(f"{result!r}: nothing in it can be drawn")
 

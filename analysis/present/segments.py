@@ -146,13 +146,13 @@ def _mean_lines(
     """Draw the mean over the joints of each plane: the position of all if they moved alike."""
     for plane in _PLANES:
         members = [(i + 1, of(j).value) for i, j in enumerate(joints) if j.plane == plane]
-        known = [(place, value) for place, value in members if value is not None]
-        if len(known) > 1:
-            values = [value for _, value in known]
+        points = [(place, value) for place, value in members if value is not None]
+        if len(points) > 1:
+            values = [value for _, value in points]
             # Mean direction (Fisher, Statistical Analysis of Circular Data, Eq. 2.9).
             turn = np.angle(np.mean(np.exp(1j * np.radians(values))))
             mean = float(np.degrees(turn)) if circular else fmean(values)
-            ends = [known[0][0] - 0.4, known[-1][0] + 0.4]
+            ends = [points[0][0] - 0.4, points[-1][0] + 0.4]
             axes.plot(ends, [mean, mean], color=REFERENCE, linestyle=DASHED, zorder=1)
 
 

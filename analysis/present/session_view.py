@@ -209,7 +209,9 @@ def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
         alike.setdefault(
             (artefact.flag, artefact.quantity, artefact.topic, artefact.note, spans), []
         ).append(artefact)
-    groups = [sorted(same, key=lambda one: order.get(one.joint, 0)) for same in alike.values()]
+    groups = [
+        sorted(same, key=lambda artefact: order.get(artefact.joint, 0)) for same in alike.values()
+    ]
     first = list(WHAT)
     groups.sort(key=lambda same: (first.index(same[0].about), order.get(same[0].joint, 0)))
     return tuple(_row(same, analysis) for same in groups)
@@ -217,11 +219,11 @@ def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
 
 def flagged_joints(joints: Sequence[JointResult]) -> tuple[tuple[str, str], ...]:
     """Return each flag of the analysed cycles with the names of its joints."""
-    found: dict[str, list[str]] = {}
+    flagged: dict[str, list[str]] = {}
     for joint in joints:
         for flag in joint.flags:
-            found.setdefault(flag, []).append(plain(joint.name))
-    return tuple((flag, _named(names, len(joints))) for flag, names in found.items())
+            flagged.setdefault(flag, []).append(plain(joint.name))
+    return tuple((flag, _named(names, len(joints))) for flag, names in flagged.items())
 
 
 def _named(names: Sequence[str], count: int) -> str:
@@ -250,16 +252,16 @@ def times_text(spans: tuple[Span, ...]) -> str:
 
 
 def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
-    one = same[0]
-    about, text = KINDS[one.flag]
+    first = same[0]
+    about, text = KINDS[first.flag]
     return ArtefactRow(
-        joints=_named([plain(each.joint) for each in same], len(analysis.joints)),
-        where=f"{one.quantity} on {one.topic}" if one.topic else one.quantity,
-        flag=one.flag,
-        meaning=f"values {text}" + (f"; {one.note}" if one.note else ""),
+        joints=_named([plain(artefact.joint) for artefact in same], len(analysis.joints)),
+        where=f"{first.quantity} on {first.topic}" if first.topic else first.quantity,
+        flag=first.flag,
+        meaning=f"values {text}" + (f"; {first.note}" if first.note else ""),
         about=WHAT[about],
-        times=times_text(one.spans_s),
-        line=_line(one, analysis),
+        times=times_text(first.spans_s),
+        line=_line(first, analysis),
     )
 
 

@@ -203,7 +203,7 @@ def _describe_panels(root: ET.Element, figure: Figure) -> None:
     """Give each panel its box, scales and labels, and mark its ticks, for the page's script."""
     size = 72 * figure.get_size_inches()
     for k, axes in enumerate(figure.axes):
-        group = next(each for each in root.iter() if each.get("id") == f"panel-{k}")
+        group = next(element for element in root.iter() if element.get("id") == f"panel-{k}")
         low, high = axes.get_position().get_points() * size
         box = [low[0], size[1] - high[1], high[0] - low[0], high[1] - low[1]]
         facts = {
@@ -212,12 +212,12 @@ def _describe_panels(root: ET.Element, figure: Figure) -> None:
             "y": _scale(figure, axes, "y"),
         }
         group.set("data-panel", plain(json.dumps(facts, ensure_ascii=False)))
-        for each in group.iter(f"{{{_SVG}}}g"):
-            name = each.get("id", "")
+        for element in group.iter(f"{{{_SVG}}}g"):
+            name = element.get("id", "")
             if match := _TICK.match(name):
-                each.set("class", f"tick {match[1]}")
+                element.set("class", f"tick {match[1]}")
             elif name.startswith(ABOVE):
-                each.set("class", "above")
+                element.set("class", "above")
 
 
 def _scale(figure: Figure, axes: Axes, name: str) -> list[object]:
@@ -258,8 +258,8 @@ def _rename_identifiers(root: ET.Element, prefix: str) -> None:
     used: dict[str, str] = {}
     for element in root.iter():
         for key, value in element.attrib.items():
-            found = [value.removeprefix("#")] if key == _XLINK else _URL.findall(value)
-            for name in found:
+            references = [value.removeprefix("#")] if key == _XLINK else _URL.findall(value)
+            for name in references:
                 used.setdefault(name, f"{prefix}-{len(used)}")
     for element in root.iter():
         name = element.attrib.pop("id", None)

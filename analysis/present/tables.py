@@ -159,7 +159,9 @@ def typical(text: int, page: int) -> tuple[Digits, Digits]:
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
     """Return the digits that show so many of the column's largest value."""
-    return lambda column: formats.decimals_for_values((one.value for one in column), digits)
+    return lambda column: formats.decimals_for_values(
+        (estimate.value for estimate in column), digits
+    )
 
 
 def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[JointResult]:
@@ -281,11 +283,13 @@ def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
     """Each joint against its mirror joint."""
     relative, most = formats.relative, typical(3, 5)
     columns: list[Column[MirrorJoint]] = [
-        Column("joint", "joint", lambda one: one.name, kind="word"),
-        Column("its mirror", "its mirror", lambda one: one.mirror, kind="word", spare=1),
-        Column("gain % (95 %)", "gain [%]", lambda one: relative(one.log_gain_difference), most),
-        Column("lag° (95 %)", "lag [°]", lambda one: degrees(one.lag_difference_rad), most),
-        Column("p", "p", lambda one: _p(one.p)),
+        Column("joint", "joint", lambda joint: joint.name, kind="word"),
+        Column("its mirror", "its mirror", lambda joint: joint.mirror, kind="word", spare=1),
+        Column(
+            "gain % (95 %)", "gain [%]", lambda joint: relative(joint.log_gain_difference), most
+        ),
+        Column("lag° (95 %)", "lag [°]", lambda joint: degrees(joint.lag_difference_rad), most),
+        Column("p", "p", lambda joint: _p(joint.p)),
     ]
     return Table(columns, reversal.joints)
 
@@ -317,18 +321,18 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
         return f"the {place}" if of_body(place) else place
 
     columns: list[Column[Difference]] = [
-        Column("joint", "where", lambda one: where(one.place), kind="word"),
-        Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
-        Column("A", "A", lambda one: _side(one, one.a), spare=2),
-        Column("B", "B", lambda one: _side(one, one.b), spare=2),
+        Column("joint", "where", lambda difference: where(difference.place), kind="word"),
+        Column("quantity", "quantity", lambda difference: WORDS[difference.quantity], kind="word"),
+        Column("A", "A", lambda difference: _side(difference, difference.a), spare=2),
+        Column("B", "B", lambda difference: _side(difference, difference.b), spare=2),
         Column("B - A (95 %, all together)", None, signed_difference),
         Column(None, "B minus A", _difference),
-        Column("p (Holm)", "p (Holm)", lambda one: _p(one.p_holm)),
-        Column("in margins", None, lambda one: f"{one.size:.2g}", spare=1),
-        Column(None, "size [margins]", lambda one: one.size, (0, 2)),
+        Column("p (Holm)", "p (Holm)", lambda difference: _p(difference.p_holm)),
+        Column("in margins", None, lambda difference: f"{difference.size:.2g}", spare=1),
+        Column(None, "size [margins]", lambda difference: difference.size, (0, 2)),
     ]
     rows = comparison.differences
-    return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT_DIFFERENCE)
+    return Table(columns, rows, bold=lambda difference: difference.p_holm < SIGNIFICANT_DIFFERENCE)
 
 
 def _side(difference: Difference, value: float) -> str:
@@ -345,18 +349,18 @@ def _difference(difference: Difference) -> Quantity:
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:
     """Return the joints that differ, the largest difference first."""
-    known = {
+    differences = {
         (difference.place, difference.quantity): _difference(difference)
         for difference in comparison.differences
     }
     columns: list[Column[NamedJoint]] = [
-        Column(None, "joint", lambda one: one.name, kind="word"),
+        Column(None, "joint", lambda joint: joint.name, kind="word"),
         *(
-            Column(None, title, lambda one, key=quantity: known.get((one.name, key)))
+            Column(None, title, lambda joint, key=quantity: differences.get((joint.name, key)))
             for quantity, title in _NAMED[comparison.commanded]
         ),
-        Column(None, "size [margins]", lambda one: one.size, (0, 1)),
-        Column(None, "p (Holm)", lambda one: _p(one.p_holm)),
+        Column(None, "size [margins]", lambda joint: joint.size, (0, 1)),
+        Column(None, "p (Holm)", lambda joint: _p(joint.p_holm)),
     ]
     return Table(columns, comparison.named, numbered=True)
 
@@ -370,10 +374,10 @@ def waveform_table(comparison: Comparison) -> Table[Waveform]:
         return math.degrees(waveform.largest_at_rad)
 
     columns: list[Column[Waveform]] = [
-        Column("mean cycle of", "joint", lambda one: one.name, kind="word"),
-        Column(rms, "RMS [°]", lambda one: math.degrees(one.rms_rad), (2, 3)),
-        Column(most, None, lambda one: signed(degrees(one.largest), "")),
-        Column(None, "largest [°]", lambda one: degrees(one.largest), (2, 2)),
+        Column("mean cycle of", "joint", lambda waveform: waveform.name, kind="word"),
+        Column(rms, "RMS [°]", lambda waveform: math.degrees(waveform.rms_rad), (2, 3)),
+        Column(most, None, lambda waveform: signed(degrees(waveform.largest), "")),
+        Column(None, "largest [°]", lambda waveform: degrees(waveform.largest), (2, 2)),
         Column(f"at {phase} °", f"at {phase} [°]", at, spare=1),
     ]
     return Table(columns, comparison.waveforms)

@@ -75,12 +75,17 @@ def _dead_bands(analysis: Analysis) -> Iterator[str]:
         if band is None:
             continue
         ends = [
-            (Estimate(one.travel_rad, one.travel_ci95), Estimate(one.step_rad, one.step_ci95))
-            for one in (band.top, band.bottom)
+            (
+                Estimate(reversal.travel_rad, reversal.travel_ci95),
+                Estimate(reversal.step_rad, reversal.step_ci95),
+            )
+            for reversal in (band.top, band.bottom)
         ]
         ends = ends[:1] if ends[0] == ends[1] else ends
-        widths = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for one, _ in ends)
-        steps = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for _, one in ends)
+        widths = ", ".join(
+            formats.estimate(formats.degrees(travel), "°", most=2) for travel, _ in ends
+        )
+        steps = ", ".join(formats.estimate(formats.degrees(step), "°", most=2) for _, step in ends)
         where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
         lag = math.degrees(band.lag_change_rad)
         yield (
@@ -93,9 +98,11 @@ def _dead_bands(analysis: Analysis) -> Iterator[str]:
 def _energy(energy: EnergyResult) -> Iterator[str]:
     cost = energy.transport
     named = (("E_net", cost.net), ("E_abs", cost.abs), ("E_el", cost.el))
-    if known := [f"{name} {formats.estimate(one, most=4)}" for name, one in named if one.value]:
+    if costs := [
+        f"{name} {formats.estimate(estimate, most=4)}" for name, estimate in named if estimate.value
+    ]:
         way = formats.estimate(cost.distance_m, " m", most=3)
-        yield f"Cost of transport E/(m g d): {', '.join(known)}, over {way}"
+        yield f"Cost of transport E/(m g d): {', '.join(costs)}, over {way}"
     if energy.unknown is not None:
         yield formats.sentence(energy.unknown)
     closure = energy.closure
@@ -110,14 +117,14 @@ def _over_time(analysis: Analysis) -> Iterator[str]:
     """Yield the range of gain and lag over cycles if there is no single gait."""
     if analysis.over_time is None or analysis.gait.frequency_hz.value is not None:
         return
-    known = [
+    cycles = [
         (gain, lag, rate)
         for joint in analysis.over_time.joints
         for gain, lag, rate in zip(joint.gain, joint.lag_rad, joint.frequency_hz, strict=True)
         if gain is not None and lag is not None
     ]
-    gains, lags, rates = (sorted(one[k] for one in known) for k in range(3))
-    low, high = (formats.degrees(Estimate(one)).value for one in (lags[0], lags[-1]))
+    gains, lags, rates = (sorted(cycle[k] for cycle in cycles) for k in range(3))
+    low, high = (formats.degrees(Estimate(lag)).value for lag in (lags[0], lags[-1]))
     yield (
         f"Cycle by cycle, by the logged phase: {len(analysis.over_time.joints)} joints, gain "
         f"{formats.number(gains[0], 2)} to {formats.number(gains[-1], 2)}, lag "
@@ -148,7 +155,9 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
     if fed := [
         oscillator for oscillator in chain.oscillators if oscillator.feedback.value is not None
     ]:
-        values = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
+        values = ", ".join(
+            f"{oscillator.name} {formats.estimate(oscillator.feedback)}" for oscillator in fed
+        )
         yield f"Feedback of each servo's own angle [1/s]: {values}."
     yield f"Method: {chain.why}, {chain.duration_s:.3g} s of phases."
 
@@ -261,7 +270,7 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         shown = _of_motion(analysis.free_motion)
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
-    if any(one.value is not None for one in analysis.heterogeneity.values()):
+    if any(index.value is not None for index in analysis.heterogeneity.values()):
         shown.append(tables.index_table(analysis.heterogeneity))
     for table in shown:
         sheet.table(table)
@@ -380,12 +389,12 @@ def contact_lines(contact: GroundContact | None) -> Iterator[str]:
     """Yield a sentence on which links are on the ground, where they are lifted."""
     if contact is None:
         return
-    links = sorted(contact.links, key=lambda one: one.share.value or 0.0)
+    links = sorted(contact.links, key=lambda link: link.share.value or 0.0)
     mean = sum(link.share.value or 0.0 for link in links) / len(links)
     if mean > _LIFTED:
         return
-    least, most = (f"{_percent(one.share)} ({one.link})" for one in (links[0], links[-1]))
-    right = " to ".join(f"{100 * one:.0f}" for one in contact.twin_accuracy)
+    least, most = (f"{_percent(link.share)} ({link.link})" for link in (links[0], links[-1]))
+    right = " to ".join(f"{100 * accuracy:.0f}" for accuracy in contact.twin_accuracy)
     yield (
         f"Ground contact, from the joints' {contact.source}: links are on the ground {least} to "
         f"{most} of a cycle, {100 * mean:.0f} % on the mean. In the twin contact and lift are "

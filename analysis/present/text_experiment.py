@@ -51,8 +51,8 @@ def best_linear_table(joints: Sequence[BestLinearJoint]) -> Table[BestLinearJoin
 
     def noise(joint: BestLinearJoint) -> Estimate:
         gain = math.hypot(*joint.response.gain)
-        known = joint.noise_sd is not None and gain > 0
-        return Estimate(100 * math.hypot(*joint.noise_sd or ()) / gain if known else None)
+        measurable = joint.noise_sd is not None and gain > 0
+        return Estimate(100 * math.hypot(*joint.noise_sd or ()) / gain if measurable else None)
 
     def share(name: str, spare: int = 0) -> Column[BestLinearJoint]:
         def percent(joint: BestLinearJoint) -> Estimate:
@@ -67,11 +67,15 @@ def best_linear_table(joints: Sequence[BestLinearJoint]) -> Table[BestLinearJoin
         return scaled(joint.response.delay_s, 1e3)
 
     columns: list[Column[BestLinearJoint]] = [
-        Column("joint", "joint", lambda one: one.response.joint, kind="word"),
-        Column("from Hz", "from [Hz]", lambda one: one.response.frequency_hz[0], (3, 4), spare=6),
-        Column("to Hz", "to [Hz]", lambda one: one.response.frequency_hz[-1], (2, 3), spare=6),
+        Column("joint", "joint", lambda joint: joint.response.joint, kind="word"),
+        Column(
+            "from Hz", "from [Hz]", lambda joint: joint.response.frequency_hz[0], (3, 4), spare=6
+        ),
+        Column("to Hz", "to [Hz]", lambda joint: joint.response.frequency_hz[-1], (2, 3), spare=6),
         Column("gain there (95 %)", "gain at the lowest [1]", lowest, typical(4, 4), spare=1),
-        Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.response.bandwidth_hz), (2, 3)),
+        Column(
+            "-3 dB Hz", "-3 dB [Hz]", lambda joint: Estimate(joint.response.bandwidth_hz), (2, 3)
+        ),
         Column("delay ms (95 %)", "delay [ms]", delay_ms, typical(2, 3), spare=2),
         Column("noise %", "noise [%]", noise, (2, 3), spare=3),
         share("distortion"),
@@ -116,19 +120,20 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
     if not changed:
         return ["What was changed: not recorded; the recorded facts are the same."]
     lines = ["What was changed (A, then B):"]
-    for one in changed[:MOST_CHANGES]:
-        a, b = ("not set" if side is None else formats.short(side) for side in (one.a, one.b))
-        lines.append(f"  {plain(one.name)}: {a} -> {b}")
+    for change in changed[:MOST_CHANGES]:
+        a, b = ("not set" if side is None else formats.short(side) for side in (change.a, change.b))
+        lines.append(f"  {plain(change.name)}: {a} -> {b}")
     rest = len(changed) - MOST_CHANGES
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
 
 
 def _equivalence(comparison: Comparison) -> str:
     parts: list[str] = []
-    for one in comparison.equivalence:
-        shown = "yes" if one.p < SIGNIFICANT_DIFFERENCE else "not shown"
+    for test in comparison.equivalence:
+        shown = "yes" if test.p < SIGNIFICANT_DIFFERENCE else "not shown"
         parts.append(
-            f"{WORDS[one.quantity]} within {margin_text(one)} {shown} (p {formats.p_value(one.p)})"
+            f"{WORDS[test.quantity]} within {margin_text(test)} {shown} "
+            f"(p {formats.p_value(test.p)})"
         )
     return f"The same within margins: {'; '.join(parts)}."
 
@@ -172,8 +177,8 @@ def render_experiment(
         sheet.lines(refusals(body))
     sheet.table(run_table(experiment))
     sheet.print()
-    own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
-    sheet.lines(f"Warning: {warning}" for warning in (*experiment.warnings, *own))
+    warnings = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
+    sheet.lines(f"Warning: {warning}" for warning in (*experiment.warnings, *warnings))
     fitted = body is not None and body.fitted
     if not experiment.coupling.identifiable and experiment.best_linear is None and not fitted:
         sheet.print(unidentified(experiment.coupling))
@@ -319,23 +324,23 @@ def travel_table(connection: BodyConnection) -> Table[PredictedTravel]:
         )
 
     def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
-        return lambda one: formats.scaled(of(one), 1000.0)
+        return lambda travel: formats.scaled(of(travel), 1000.0)
 
     columns: list[Column[PredictedTravel]] = [
-        Column("session", "session", lambda one: formats.filename(one.path), kind="word"),
-        Column("Hz", None, lambda one: one.frequency_hz, (3, 3), spare=3),
-        column("forward", "mm", mm(lambda one: one.forward_m)),
-        column("measured", "mm", mm(lambda one: one.measured_forward_m)),
-        column("left", "mm", mm(lambda one: one.left_m), 2),
-        column("measured left", "mm", mm(lambda one: one.measured_left_m), 2),
-        column("turn", "°", lambda one: formats.degrees(one.turn_rad)),
-        column("measured turn", "°", lambda one: formats.degrees(one.measured_turn_rad)),
+        Column("session", "session", lambda travel: formats.filename(travel.path), kind="word"),
+        Column("Hz", None, lambda travel: travel.frequency_hz, (3, 3), spare=3),
+        column("forward", "mm", mm(lambda travel: travel.forward_m)),
+        column("measured", "mm", mm(lambda travel: travel.measured_forward_m)),
+        column("left", "mm", mm(lambda travel: travel.left_m), 2),
+        column("measured left", "mm", mm(lambda travel: travel.measured_left_m), 2),
+        column("turn", "°", lambda travel: formats.degrees(travel.turn_rad)),
+        column("measured turn", "°", lambda travel: formats.degrees(travel.measured_turn_rad)),
     ]
     return Table(columns, connection.predicted)
 
 
 def refusals(connection: BodyConnection) -> Iterator[str]:
     """Yield a sentence on each session that is not predicted."""
-    for one in connection.predicted:
-        if one.why is not None:
-            yield f"{formats.filename(one.path)} is not predicted: {one.why}."
+    for travel in connection.predicted:
+        if travel.why is not None:
+            yield f"{formats.filename(travel.path)} is not predicted: {travel.why}."

@@ -303,7 +303,7 @@ class Analysis(PresentedResult):
             if self.ground_contact is None
             else _contact_dict(self.ground_contact),
             "energy": None if self.energy is None else _energy_dict(self.energy),
-            "frequency_response": [_record(one) for one in self.frequency_response],
+            "frequency_response": [_record(response) for response in self.frequency_response],
             "tracking": [_record(joint) for joint in self.tracking],
             "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
             "artefacts": [
@@ -332,10 +332,10 @@ def interval_key(key: str) -> str:
 def _estimates(record: Any) -> dict[str, Any]:
     """Return each estimate of a record as two keys: its value and its interval."""
     flat: dict[str, Any] = {}
-    for each in dataclasses.fields(record):
-        one, key = getattr(record, each.name), each.name
-        if isinstance(one, Estimate):
-            flat |= {key: one.value, interval_key(key): one.ci95}
+    for attribute in dataclasses.fields(record):
+        value, key = getattr(record, attribute.name), attribute.name
+        if isinstance(value, Estimate):
+            flat |= {key: value.value, interval_key(key): value.ci95}
     return flat
 
 
@@ -345,8 +345,8 @@ def _record(record: Any) -> dict[str, Any]:
 
 def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
     cost = energy.transport
-    known = {"mass_kg": cost.mass_kg, "why": cost.why} | _estimates(cost)
-    return dataclasses.asdict(energy) | {"transport": known}
+    transport = {"mass_kg": cost.mass_kg, "why": cost.why} | _estimates(cost)
+    return dataclasses.asdict(energy) | {"transport": transport}
 
 
 def _motion_dict(motion: FreeMotion) -> dict[str, Any]:
@@ -373,7 +373,7 @@ def _contact_dict(contact: GroundContact) -> dict[str, Any]:
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:
     def points(some: tuple[BodyPoint, ...]) -> list[dict[str, Any]]:
-        return [{"place": one.place, "link": one.link} | _estimates(one) for one in some]
+        return [{"place": point.place, "link": point.link} | _estimates(point) for point in some]
 
     null = {name: points(some) for name, some in body.null.items()}
     return {"plane": body.plane, "observed": points(body.observed), "null": null}

@@ -152,8 +152,8 @@ class Remarks:
             One sentence each.
         """
         every = self._sentences.values()
-        lacking = [one for one in every if isinstance(one, Lacking)]
-        others = [one for one in every if not isinstance(one, (Lacking, Note))]
+        lacking = [sentence for sentence in every if isinstance(sentence, Lacking)]
+        others = [sentence for sentence in every if not isinstance(sentence, (Lacking, Note))]
         return tuple(map(str, dict.fromkeys([*lacking, *of_the_file, *others])))
 
     @property
@@ -417,12 +417,12 @@ def flags_by_joint(artefacts: Iterable[Artefact]) -> dict[str, list[str]]:
     Returns:
         Joint name to flags, each once.
     """
-    found: dict[str, list[str]] = {}
+    by_joint: dict[str, list[str]] = {}
     for artefact in artefacts:
-        flags = found.setdefault(artefact.joint, [])
+        flags = by_joint.setdefault(artefact.joint, [])
         if artefact.flag not in flags:
             flags.append(artefact.flag)
-    return found
+    return by_joint
 
 
 def overlapping(spans: Sequence[Span], start_s: float, stop_s: float) -> bool:

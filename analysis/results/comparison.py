@@ -281,9 +281,11 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         first = next(module for module in modules if module.name == named[0])
         clear = {kind: e for kind, e in first.relative.items() if leaves_out_zero(e.ci95)}
         shown = (clear or first.relative).items()
-        own = ", ".join(f"{_words(kind)} {formats.percent(one)}" for kind, one in shown)
+        deviations = ", ".join(
+            f"{_words(kind)} {formats.percent(relative)}" for kind, relative in shown
+        )
         also = f"; then {', '.join(named[1:])}" if len(named) > 1 else ""
-        return f"{first.name} deviates: {own} ({formats.p_value_text(p)}){also}"
+        return f"{first.name} deviates: {deviations} ({formats.p_value_text(p)}){also}"
     if fit_p < SIGNIFICANT:
         return (
             f"neither identical modules nor a single one that deviates explain this session "

@@ -240,5 +240,5 @@ class Experiment(PresentedResult):
         An estimate becomes an object of ``value`` and ``ci95``; each session is the object that
         it gives by itself.
         """
-        own = dataclasses.asdict(dataclasses.replace(self, sessions=()))
-        return own | {"sessions": [session.to_dict() for session in self.sessions]}
+        record = dataclasses.asdict(dataclasses.replace(self, sessions=()))
+        return record | {"sessions": [session.to_dict() for session in self.sessions]}

@@ -119,13 +119,13 @@ def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) 
         Digits after the point, the same for the whole column so that it lines up. Without any
         interval, four digits of the largest value.
     """
-    known = list(quantities)
-    ends = (q.ci95 for q in known if q.ci95 is not None)
+    estimates = list(quantities)
+    ends = (q.ci95 for q in estimates if q.ci95 is not None)
     if half := sorted(0.5 * (high - low) for low, high in ends if high > low):
-        wanted = _decimals_of(half[len(half) // 2])
+        decimals = _decimals_of(half[len(half) // 2])
     else:
-        wanted = decimals_for_values((q.value for q in known), 4)
-    return min(max(wanted, least), most)
+        decimals = decimals_for_values((q.value for q in estimates), 4)
+    return min(max(decimals, least), most)
 
 
 def _decimals_of(half_width: float) -> int:
@@ -258,9 +258,9 @@ def short(text: str, most: int = 40) -> str:
     Args:
         most: Characters kept at most; the middle gives way, since names differ at their ends.
     """
-    known = plain(text)
-    cut = known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
-    return known if len(known) <= most else cut
+    whole = plain(text)
+    cut = whole[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + whole[-(most - most // 2 - 1) :]
+    return whole if len(whole) <= most else cut
 
 
 def filename(path: str) -> str:

@@ -72,13 +72,13 @@ class Facts:
 
 def compose(facts: Facts) -> Answer:
     """Compose the answer of one session."""
-    known = [joint for joint in facts.joints if joint.gain.value is not None]
+    with_gain = [joint for joint in facts.joints if joint.gain.value is not None]
     first = _named(facts)
     broken = f"{facts.left_out[:1].upper()}{facts.left_out[1:]}." if facts.left_out else ""
-    verdict, rest, detail = _rest(facts, known)
+    verdict, rest, detail = _rest(facts, with_gain)
     if first:
         verdict = Verdict.UNLIKE
-        detail = _responding(facts, known) + _caveat(facts.joints)
+        detail = _responding(facts, with_gain) + _caveat(facts.joints)
     findings = facts.findings
     differs = first or findings.shape or findings.undecided
     alike = False if differs else None
@@ -116,19 +116,19 @@ def find(indices: Mapping[str, Index], stem: str) -> dict[str, Index]:
         End of the name, e.g. ``horizontal``, ``vertical_group1`` or an empty string, to the index.
     """
     pattern = re.compile(rf"{re.escape(stem)}_?((?:horizontal|vertical)?(?:_?group\d+)?)")
-    found = {name: pattern.fullmatch(name) for name in indices}
+    matches = {name: pattern.fullmatch(name) for name in indices}
     return {
         match[1]: indices[name]
-        for name, match in found.items()
+        for name, match in matches.items()
         if match is not None and indices[name].value is not None
     }
 
 
 def _named(facts: Facts) -> str:
     """Return the joints that do not follow, then those that stand out; empty for none."""
-    clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
+    clauses = [fault_in_words(fault) for fault in facts.not_following[:NAMED]]
     if len(facts.not_following) > NAMED:
-        names = [plain(each.joint) for each in facts.not_following[NAMED:]]
+        names = [plain(fault.joint) for fault in facts.not_following[NAMED:]]
         clauses.append(f"{', '.join(names)} do not follow either")
     if facts.judgement.naming:
         clauses.insert(0, plain(facts.judgement.naming))
@@ -144,13 +144,15 @@ def _named(facts: Facts) -> str:
     changed = {change.joint for change in judged.changes}
     off = {rest.joint for rest in judged.rests}
     by_joint: dict[str, list[StandOut]] = {}
-    for each in facts.findings.stand_out:
+    for deviation in facts.findings.stand_out:
         # What the mean of before and after shows, or a rest has shown.
-        if each.joint in changed or (each.quantity == "offset" and each.joint in off):
+        if deviation.joint in changed or (
+            deviation.quantity == "offset" and deviation.joint in off
+        ):
             continue
-        by_joint.setdefault(each.joint, []).append(each)
+        by_joint.setdefault(deviation.joint, []).append(deviation)
     for joint, several in list(by_joint.items())[:NAMED]:
-        sizes = " and ".join(deviation_in_words(each) for each in several)
+        sizes = " and ".join(deviation_in_words(deviation) for deviation in several)
         clause = f"{plain(joint)} responds differently from the others, {sizes}"
         end = joint in _ends(facts, several[0].plane, several[0].group)
         clauses.append(f"{clause}: the joint or the boundary" if end else clause)
@@ -167,7 +169,9 @@ def _named(facts: Facts) -> str:
 def _apart(facts: Facts) -> tuple[Apart, ...]:
     """Return the joints whose response lies apart, where no closer comparison names them."""
     compared = {*facts.findings.compared}
-    return tuple(each for each in facts.judgement.apart if each.joint not in compared)
+    return tuple(
+        deviation for deviation in facts.judgement.apart if deviation.joint not in compared
+    )
 
 
 def _low_gains(facts: Facts) -> tuple[JointTracking, ...]:
@@ -184,8 +188,8 @@ def _left_out(facts: Facts) -> str:
 
     Empty where nothing was compared, unless no joint could be judged.
     """
-    known = {*facts.findings.compared, *(each.joint for each in facts.not_following)}
-    names = [name for name in facts.commanded if name not in known]
+    covered = {*facts.findings.compared, *(fault.joint for fault in facts.not_following)}
+    names = [name for name in facts.commanded if name not in covered]
     if not facts.findings.compared and facts.judgement.judged:
         return ""
     asked = {name: rad for name, rad in facts.judgement.unexposed if name in names}
@@ -301,7 +305,7 @@ def _motion(facts: Facts, motion: FreeMotion) -> str:
     else:
         sizes = [math.degrees(joint.amplitude_rad.value or 0.0) for joint in motion.joints]
         lead = f"{lead} of {min(sizes):.3g}° to {max(sizes):.3g}°"
-    return "; ".join((lead, *(_wave(one) for one in whole))) + "."
+    return "; ".join((lead, *(_wave(joint) for joint in whole))) + "."
 
 
 def _wave(wave: BodyWave) -> str:
@@ -335,11 +339,13 @@ def _size_of(number: Estimate) -> float:
 
 def _swept(responses: Sequence[JointFrequencyResponse], tracking: Sequence[JointTracking]) -> str:
     """Return the sentence on frequency responses."""
-    kinds = " and ".join(sorted({one.excitation for one in responses}))
-    band = _range([f for one in responses for f in (one.frequency_hz[0], one.frequency_hz[-1])])
+    kinds = " and ".join(sorted({response.excitation for response in responses}))
+    band = _range(
+        [f for response in responses for f in (response.frequency_hz[0], response.frequency_hz[-1])]
+    )
     text = f"No gait: the commands are of the kind {kinds}; frequency response of {len(responses)} "
     text += f"joint{'s' if len(responses) > 1 else ''} from {band} Hz"
-    edges = [one.bandwidth_hz for one in responses if one.bandwidth_hz is not None]
+    edges = [response.bandwidth_hz for response in responses if response.bandwidth_hz is not None]
     lags = [1e3 * (joint.lag_s.value or 0.0) for joint in tracking if joint.explained >= FOLLOWS]
     text += f", -3 dB at {_range(edges)} Hz" if edges else ""
     text += f", lag {_range(lags)} ms" if lags else ""
@@ -369,7 +375,7 @@ def _compared(facts: Facts, *, named: bool) -> tuple[Verdict, str]:
     if findings.alike and (named or _everyone(facts)):
         judged = facts.judgement
         differ = (*findings.stand_out, *judged.changes, *judged.extra, *judged.rests)
-        left = len({*findings.compared} - {each.joint for each in differ})
+        left = len({*findings.compared} - {finding.joint for finding in differ})
         named = named and left > 0
         left = left or len(findings.compared)
         others = f"The other {left} joints" if named else f"The segments move alike: all {left}"
@@ -389,18 +395,18 @@ def _everyone(facts: Facts) -> bool:
 def _shapes(facts: Facts) -> str:
     """Return the largest shape of lag and of gain of each plane."""
     clauses: list[str] = []
-    chains = dict.fromkeys((each.plane, each.group) for each in facts.findings.shape)
+    chains = dict.fromkeys((shape.plane, shape.group) for shape in facts.findings.shape)
     for plane, group in sorted(chains):
         word = _joints_word(facts, plane, group)
         for quantity in ("lag", "gain"):
-            own = [
-                each
-                for each in facts.findings.shape
-                if (each.plane, each.group, each.quantity) == (plane, group, quantity)
+            shapes = [
+                shape
+                for shape in facts.findings.shape
+                if (shape.plane, shape.group, shape.quantity) == (plane, group, quantity)
             ]
-            shaped = [each for each in own if each.kind != "each"]
-            ends = [each for each in shaped if each.kind == "ends"]
-            clauses += [_shape(end, word) for end in (ends or shaped or own)[:1]]
+            shaped = [shape for shape in shapes if shape.kind != "each"]
+            ends = [shape for shape in shaped if shape.kind == "ends"]
+            clauses += [_shape(end, word) for end in (ends or shaped or shapes)[:1]]
     boundary = _boundary(facts)
     return f"{'; '.join(clauses)} ({boundary})" if boundary else "; ".join(clauses)
 
@@ -424,8 +430,8 @@ def _shape(shape: Shape, joints: str) -> str:
         what = f"lag {text} {more}" if lag else f"have {text} {more} gain"
         return f"the outer {joints} {what} than the inner ones, alike on both sides"
     # The table names the joint with the largest: one of many sound joints always has it.
-    own = f"each of the {joints} has a {shape.quantity} of its own"
-    return f"{own}, up to {text} {more} than the others"
+    individual = f"each of the {joints} has a {shape.quantity} of its own"
+    return f"{individual}, up to {text} {more} than the others"
 
 
 def _joints_word(facts: Facts, plane: str, group: int) -> str:
@@ -442,7 +448,7 @@ def _responding(facts: Facts, results: Sequence[JointResult]) -> str:
     if facts.gait.frequency_hz.value is None:
         return _why_not(facts, "no gait")
     frequency = formats.gait_frequency(facts.gait)
-    silent = {each.joint for each in facts.not_following}
+    silent = {fault.joint for fault in facts.not_following}
     responding = [joint for joint in results if joint.name not in silent]
     text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"
     if lags := [(lag, j.name) for j in responding if (lag := j.lag_rad.value) is not None]:
@@ -450,9 +456,9 @@ def _responding(facts: Facts, results: Sequence[JointResult]) -> str:
         ends = [f"{formats.number(math.degrees(v), 1)}° ({plain(k)})" for v, k in (first, last)]
         text += f"; lag runs from {' to '.join(ends)}"
     evidence = [
-        f" {plain(each.joint)} {each.evidence}."
-        for each in facts.not_following[:NAMED]
-        if each.kinds != ("lost_samples",)
+        f" {plain(fault.joint)} {fault.evidence}."
+        for fault in facts.not_following[:NAMED]
+        if fault.kinds != ("lost_samples",)
     ]
     return text + "." + "".join(evidence)
 

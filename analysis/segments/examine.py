@@ -121,40 +121,42 @@ def examine(chains: Iterable[Chain]) -> Findings:
     for chain, quantity, profile in profiles:
         if len(chain.names) < MIN_JOINTS:
             continue
-        for each in standing_out(profile, critical):
-            if chain.names[each.joint] in chain.loaded:
+        for deviation in standing_out(profile, critical):
+            if chain.names[deviation.joint] in chain.loaded:
                 continue
-            excluded[id(chain)].add(each.joint)
-            out.append(_stand_out(chain, each.joint, quantity, each, critical))
+            excluded[id(chain)].add(deviation.joint)
+            out.append(_stand_out(chain, deviation.joint, quantity, deviation, critical))
     for chain in some:
         out += _offset(chain, critical)
     for chain, quantity, profile in profiles:
         active = np.ones(len(chain.names), dtype=np.bool_)
         active[list(excluded[id(chain)])] = False
         half = float(np.var(profile.values[active])) / 2
-        found = [
+        significant = [
             contrast
             for contrast in contrasts(profile, active)
             if reaches(abs(contrast.value), critical * contrast.error, profile.margin)
             and (contrast.kind == "each" or contrast.spread**2 >= half)
         ]
         if len(chain.names) < MIN_JOINTS:
-            if found:
+            if significant:
                 undecided[chain.plane, chain.group] = None
             continue
-        if any(each.kind == "ends" for each in found) and _spikes(profile.values[active]):
+        if any(contrast.kind == "ends" for contrast in significant) and _spikes(
+            profile.values[active]
+        ):
             names = [name for name, there in zip(chain.names, active, strict=True) if there]
             boundary[names[0], names[-1]] = None
         shapes += [
-            (each.spread / _MARGINS[quantity], _shape(chain, quantity, each, critical))
-            for each in found
+            (contrast.spread / _MARGINS[quantity], _shape(chain, quantity, contrast, critical))
+            for contrast in significant
         ]
     alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)
     alike = alike and not (shapes or kinds)
-    out.sort(key=lambda each: -abs(each.deviation) / _MARGINS.get(each.quantity, OFFSET_RAD))
+    out.sort(key=lambda joint: -abs(joint.deviation) / _MARGINS.get(joint.quantity, OFFSET_RAD))
     return Findings(
         stand_out=_ranked(out),
-        shape=tuple(shape for _, shape in sorted(shapes, key=lambda each: -each[0])),
+        shape=tuple(shape for _, shape in sorted(shapes, key=lambda ranked: -ranked[0])),
         undecided=tuple(undecided),
         alike=True if alike else None,
         boundary=tuple(boundary),
@@ -234,8 +236,8 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     Their errors come from the scatter between cycles, so they are outside the family of gain and
     lag; the margin is many times what noise makes of a mean.
     """
-    known = {name for name, offset in chain.offsets.items() if offset.size >= _MIN_CYCLES}
-    index = [k for k, name in enumerate(chain.names) if name in known]
+    recorded = {name for name, offset in chain.offsets.items() if offset.size >= _MIN_CYCLES}
+    index = [k for k, name in enumerate(chain.names) if name in recorded]
     if len(index) < MIN_JOINTS:
         return []
     cycles = min(chain.offsets[chain.names[k]].size for k in index)
@@ -247,8 +249,8 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     scatter = Scatter(columns, nothing, nothing)
     profile = Profile(place, len(chain.commanded), values, scatter, OFFSET_RAD)
     return [
-        _stand_out(chain, index[each.joint], "offset", each, critical)
-        for each in standing_out(profile, critical)
+        _stand_out(chain, index[deviation.joint], "offset", deviation, critical)
+        for deviation in standing_out(profile, critical)
     ]
 
 
@@ -296,6 +298,6 @@ def _shape(chain: Chain, quantity: str, contrast: Contrast, critical: float) -> 
 
 def _ranked(out: Sequence[StandOut]) -> tuple[StandOut, ...]:
     """Rank joints by their largest deviation; both quantities of a joint have its rank."""
-    order = list(dict.fromkeys(each.joint for each in out))
-    ranked = [replace(each, rank=1 + order.index(each.joint)) for each in out]
-    return tuple(sorted(ranked, key=lambda each: each.rank))
+    order = list(dict.fromkeys(deviation.joint for deviation in out))
+    ranked = [replace(deviation, rank=1 + order.index(deviation.joint)) for deviation in out]
+    return tuple(sorted(ranked, key=lambda deviation: deviation.rank))

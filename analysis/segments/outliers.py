@@ -93,19 +93,23 @@ def standing_out(profile: Profile, critical: float) -> list[Deviation]:
         Their deviations from the prediction of the rest, the largest first.
     """
     trimmed, grown = (
-        [one for joint in state.outside if (one := _kept(profile, state, joint, critical))]
+        [
+            deviation
+            for joint in state.outside
+            if (deviation := _kept(profile, state, joint, critical))
+        ]
         for state in (_trimmed(profile, critical), _grown(profile, critical))
     )
     # Two that stand out hide each other from the one search, a profile its joints from the other.
     # Where both agree, the shapes that the data ask for predict more closely than a parabola.
-    agree = {one.joint for one in trimmed} == {one.joint for one in grown}
-    found = grown if agree or len(grown) > len(trimmed) else trimmed
-    return sorted(found, key=lambda one: -abs(one.value))
+    agree = {deviation.joint for deviation in trimmed} == {deviation.joint for deviation in grown}
+    deviations = grown if agree or len(grown) > len(trimmed) else trimmed
+    return sorted(deviations, key=lambda deviation: -abs(deviation.value))
 
 
 def _kept(profile: Profile, state: State, joint: int, critical: float) -> Deviation | None:
-    one = _deviation_of(profile, state, joint)
-    return one if _stands_out(profile, state, one, critical) else None
+    deviation = _deviation_of(profile, state, joint)
+    return deviation if _stands_out(profile, state, deviation, critical) else None
 
 
 def _grown(profile: Profile, critical: float) -> State:
@@ -298,7 +302,7 @@ def _out_of_profile(
     place = profile.place
     first, last = place[others].min(), place[others].max()
     extrapolated = not first <= place[deviation.joint] <= last and abs(deviation.value) <= reach
-    if (extrapolated and not smooth) or min(each / deviation.value for each in beside) < LOCAL:
+    if (extrapolated and not smooth) or min(value / deviation.value for value in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[deviation.joint])
     if not mirror.size or mirror[0] == deviation.joint:
@@ -307,29 +311,29 @@ def _out_of_profile(
     by_model = float(rows[partner] @ profile.values)
     rest = others[others != partner]
     beside = _beside_neighbours(profile, rest, partner)
-    shown = [each / deviation.value for each in (by_model, *beside)]
+    shown = [value / deviation.value for value in (by_model, *beside)]
     if not any(MIRRORED <= abs(share) <= 1 / MIRRORED for share in shown):
         return True
     # A shape of the body has its flanks: inside of the ends, a pair that the joints on both sides
     # don't follow is two joints.
     inner = first < place[deviation.joint] < last and first < place[partner] < last
     away = (*_beside_neighbours(profile, rest, deviation.joint), *beside)
-    return bool(inner) and min(each / deviation.value for each in away) > 1 - LOCAL
+    return bool(inner) and min(value / deviation.value for value in away) > 1 - LOCAL
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:
     """A joint's deviation from the line of its neighbours; at an end also from the nearest."""
     place, values = profile.place, profile.values
-    own = float(place[joint])
-    below = others[place[others] < own]
-    above = others[place[others] > own]
+    position = float(place[joint])
+    below = others[place[others] < position]
+    above = others[place[others] > position]
     if below.size and above.size:
         left, right = int(below[-1]), int(above[0])
-        share = (own - place[left]) / (place[right] - place[left])
+        share = (position - place[left]) / (place[right] - place[left])
         return (float(values[joint] - (1 - share) * values[left] - share * values[right]),)
     near = (above if above.size else below[::-1])[:2]
     flat = float(values[joint] - values[near[0]])
     if near.size < 2:
         return (flat,)
     slope = (values[near[0]] - values[near[1]]) / (place[near[0]] - place[near[1]])
-    return flat, flat - float(slope * (own - place[near[0]]))
+    return flat, flat - float(slope * (position - place[near[0]]))

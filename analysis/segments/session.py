@@ -127,7 +127,7 @@ def stopped(faulty: Iterable[NotFollowing]) -> frozenset[str]:
     Returns:
         Their names, without those of which samples are missing only.
     """
-    return frozenset(each.joint for each in faulty if set(each.kinds) - _COMPARABLE)
+    return frozenset(fault.joint for fault in faulty if set(fault.kinds) - _COMPARABLE)
 
 
 def compare_joints(
