@@ -127,8 +127,8 @@ JUDGEMENT = Part("judgement", _judgement)
 
 
 def _artefacts(signals: Signals, done: Results, remarks: Remarks) -> Artefacts:
-    found = find_artefacts(signals.session, signals.columns)
-    artefacts = unrefuted(found, done[JUDGEMENT].following)
+    suspected = find_artefacts(signals.session, signals.columns)
+    artefacts = unrefuted(suspected, done[JUDGEMENT].following)
     limits_s = signals.window.since(signals.start_ns)
     held = tuple(artefact for artefact in artefacts if artefact.within(*limits_s))
     false = [artefact.joint for artefact in held if artefact.falsifies("position")]
