@@ -16,7 +16,7 @@ from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
 from undulog.analysis.parts.episodes.result import EpisodesResult
 from undulog.analysis.results import analysis, answer, oscillators
-from undulog.analysis.results.analysis import Analysis, interval_key
+from undulog.analysis.results.analysis import KEYS_OF_THEIR_OWN, Analysis, interval_key
 from undulog.analysis.results.body import BodyPoint, BodyTravel, LinkContact, Serpenoid, ShapeMode
 from undulog.analysis.results.comparison import Comparison
 from undulog.analysis.results.cycles import Transport
@@ -111,6 +111,8 @@ class _Writer:
         described = _descriptions(cls)
         properties: dict[str, Any] = {}
         for one in fields(cls):
+            if one.metadata == KEYS_OF_THEIR_OWN:
+                continue
             about = {"description": described[one.name]} if one.name in described else {}
             if self._flat and cls in _FLAT and hints[one.name] is Estimate:
                 properties[one.name] = about | {"type": ["number", "null"]}

@@ -17,6 +17,7 @@ from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
     from ..results.answer import Remarks
+    from .shown import Shown
     from .signals import Signals
 
 R = TypeVar("R")
@@ -34,6 +35,9 @@ class Part(Generic[R]):
         reads: Names of further parts whose results it reads where they are measured.
         of_commands: Whether it reads the commands' samples, which are held until the last part
             that does.
+        result: Frozen dataclass of its result, where that has a key of the part's name in the JSON;
+            the measurement may then be None as well.
+        show: Returns the tables and figures of such a result.
     """
 
     name: str
@@ -41,6 +45,8 @@ class Part(Generic[R]):
     needs: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
     of_commands: bool = False
+    result: type[R] | None = None
+    show: Callable[[R], Shown] | None = None
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
 from ..results.frequency_response import JointTracking
 from ..results.oscillators import ChainCoupling, Link, Mode, Rate
+from .text import shown_parts
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 
@@ -174,7 +175,24 @@ def _of_analysis(result: Analysis) -> Frames:
     if shape is not None and shape.travel is not None:
         frames["travel"] = table(BodyTravel, [shape.travel])
     frames["artefacts"] = _artefacts(result.artefacts)
+    frames |= _of_parts(result, frames)
     return frames | _oscillators(result.oscillators)
+
+
+def _of_parts(result: Analysis, taken: Iterable[str]) -> Frames:
+    """Return the tables of the parts that other packages add, under the names of the parts."""
+    frames: Frames = {}
+    for name, part in shown_parts(result).items():
+        for k, rows in enumerate(shown.rows for shown in part.tables):
+            frame = name if k == 0 else f"{name}_{k + 1}"
+            if frame in taken:
+                raise UsageError(
+                    f"the part {name!r} has a table of the name {frame!r}, as others do"
+                )
+            if rows:
+                kind = cast("type[Any]", type(rows[0]))
+                frames[frame] = table(kind, rows)
+    return frames
 
 
 def _of_experiment(result: Experiment) -> Frames:

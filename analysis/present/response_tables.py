@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+from ..parts.shown import Column, Ends, Quantity, Table, typical
 from ..results.analysis import GaitWindow
 from ..results.estimate import Estimate
 from ..results.formats import degrees, scaled
@@ -16,7 +17,6 @@ from ..results.frequency_response import (
     JointTracking,
     LocalWaveNumber,
 )
-from .tables import Column, Ends, Quantity, Table, typical
 
 
 def frequency_table(responses: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:

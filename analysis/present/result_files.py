@@ -175,7 +175,18 @@ def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
             built[name] = Estimate(value, _build(hint["ci95"], data[interval_key(name)]))
         else:
             built[name] = _build(hints[name], data[name])
+    if issubclass(chosen, Analysis):
+        others = {name: data[name] for name in data if name not in hints}
+        built["more"] = {name: _of_part(name, value) for name, value in others.items()}
     return chosen(**built)
+
+
+def _of_part(name: str, value: Any) -> Any:
+    """Return the result of a part that another package adds; plain values where it isn't there."""
+    from ..session.added_parts import added_parts
+
+    part = next((part for part in added_parts() if part.name == name), None)
+    return value if part is None else _build(part.result, value)
 
 
 def headline(result: object) -> str:  # noqa: PLR0911 - one kind of result a case

@@ -25,9 +25,10 @@ from ..session.cycles import CycleMaps
 from .bode import bode, cycle_drawings
 from .matrix import Entries, entries_of, matrix_picture
 from .page_tables import element, is_driven, joint_mark, key_figures, session_trials
+from .part_figures import draw
 from .segments import body_motion, segments
 from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
-from .text import chain_detail
+from .text import chain_detail, shown_parts
 
 CYCLES = 2.5
 """Gait cycles shown."""
@@ -325,6 +326,18 @@ def session_view(
         "signals": command_response(traces, len(joints), f"{at}signals-figure") if traces else None,
         "maps": () if cycles is None else cycle_drawings(cycles, f"{at}map"),
         "artefacts": artefact_rows(analysis),
+        "parts": [
+            {
+                "name": name,
+                "title": part.title,
+                "tables": part.tables,
+                "drawings": [
+                    draw(figure, part.title, f"{at}{name}-{k}-figure")
+                    for k, figure in enumerate(part.figures, start=1)
+                ],
+            }
+            for name, part in shown_parts(analysis).items()
+        ],
         "flagged": flagged_joints(joints),
         "body": body_motion(body, f"{at}body-figure")
         if body is not None and body.observed

@@ -1,6 +1,7 @@
 """The tables of results, each described once: headings, values, digits, what is shown where.
 
-The terminal (:mod:`.text`) and the page (:mod:`.page_tables`) lay them out. JSON, pandas
+Their model is :mod:`.analysis.parts.shown`; the terminal (:mod:`.text`) and the page
+(:mod:`.page_tables`) lay them out. JSON, pandas
 frames and Parquet hold every field of the same dataclasses in full and in SI units, so that their
 names and types follow from the fields (:mod:`.data_frames`).
 """
@@ -9,9 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Generic, Literal, TypeVar
 
 from ..compare.decisions import (
     SIGNIFICANT_DIFFERENCE,
@@ -22,6 +21,7 @@ from ..compare.decisions import (
     signed,
     signed_difference,
 )
+from ..parts.shown import Column, Ends, PValue, Quantity, Table, typical
 from ..results import formats
 from ..results.analysis import Analysis, Index, JointResult
 from ..results.body import BodyPoint, BodyResult
@@ -29,12 +29,6 @@ from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, o
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
-
-Row = TypeVar("Row")
-Digits = int | Callable[[Sequence[Estimate]], int]
-"""Digits after the point: fixed, or from all numbers of the column."""
-
-TERMINAL, PAGE = 0, 1
 
 _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | None], ...] = (
     ("E_net", "integral of torque times velocity", lambda j: j.energy_net_j, 3),
@@ -51,110 +45,8 @@ _NAMED = {
 }
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A number with its digits after the point and its unit, which has its own space."""
-
-    estimate: Estimate
-    decimals: int
-    unit: str = ""
-
-
-@dataclass(frozen=True)
-class Ends:
-    """An interval in a cell of its own."""
-
-    low: Quantity
-    high: Quantity
-
-
-class PValue(float):
-    """A p-value."""
-
-
-Cell = str | int | Quantity | Ends | PValue | None
-"""What stands in a cell; None is printed as a dash."""
-
-
-@dataclass(frozen=True)
-class Column(Generic[Row]):
-    """A column of a table.
-
-    Attributes:
-        text: Heading on a terminal, with the unit; None: not shown there.
-        page: Heading on the page, with the unit; None: not shown there.
-        of: The cell of a row, or a number in the unit of the heading.
-        digits: Of numbers, on a terminal and on the page.
-        kind: Numbers are set to the right; sentences wrap on the page.
-        spare: A narrow terminal goes without the columns of the least number first; 0 stays.
-    """
-
-    text: str | None
-    page: str | None
-    of: Callable[[Row], Cell | Estimate | float]
-    digits: tuple[Digits, Digits] = (0, 0)
-    kind: Literal["number", "word", "sentence", "code"] = "number"
-    spare: int = 0
-
-    def cells(self, rows: Sequence[Row], where: int) -> list[Cell]:
-        """Return the cells of the column.
-
-        Args:
-            where: ``TERMINAL`` or ``PAGE``.
-        """
-        values = [_number(self.of(row)) for row in rows]
-        digits = self.digits[where]
-        if not isinstance(digits, int):
-            digits = digits([value for value in values if isinstance(value, Estimate)])
-        return [
-            Quantity(value, digits) if isinstance(value, Estimate) else value for value in values
-        ]
-
-
-@dataclass(frozen=True)
-class Table(Generic[Row]):
-    """A table of a result.
-
-    Attributes:
-        columns: The columns; the first one on the page names the row.
-        rows: What each row is about.
-        bold: Whether a row is set in bold.
-        numbered: Whether rows are counted on the page.
-        about: Page heading of a column to what it is, shown above the table on the page.
-    """
-
-    columns: Sequence[Column[Row]]
-    rows: Sequence[Row]
-    bold: Callable[[Row], bool] = lambda _: False
-    numbered: bool = False
-    about: Mapping[str, str] = field(default_factory=dict[str, str])
-
-    @property
-    def notes(self) -> str:
-        """The notes on columns, for the page."""
-        heads = [str(column.page) for column in self.columns if column.page in self.about]
-        return "; ".join(f"{head.split(' [')[0]}: {self.about[head]}" for head in heads)
-
-
-def _number(value: Cell | Estimate | float) -> Cell | Estimate:
-    """A value; a bare number as an estimate without interval."""
-    if isinstance(value, float) and not isinstance(value, PValue):
-        return Estimate(value)
-    return value
-
-
 def _p(p: float | None) -> PValue | None:
     return None if p is None else PValue(p)
-
-
-def typical(text: int, page: int) -> tuple[Digits, Digits]:
-    """Return the digits that the typical interval of the column deserves, at most so many.
-
-    Args:
-        text: On a terminal.
-        page: On the page.
-    """
-    return partial(formats.decimals_for, most=text), partial(formats.decimals_for, most=page)
 
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
@@ -381,6 +273,3 @@ def waveform_table(comparison: Comparison) -> Table[Waveform]:
         Column(f"at {phase} °", f"at {phase} [°]", at, spare=1),
     ]
     return Table(columns, comparison.waveforms)
-
-
-AnyTable = Table[Any]

@@ -12,6 +12,7 @@ import numpy as np
 from undulog.capture.common import console as text_table
 from undulog.capture.common.console import UNLIMITED, plain
 
+from ..parts.shown import TERMINAL, AnyTable, Cell, Column, Ends, PValue, Quantity, Shown, Table
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.body import BodyShape, GroundContact, PlaneShape
@@ -30,7 +31,6 @@ from .response_tables import (
     tracking_table,
     wave_table,
 )
-from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
     "sensor": "Artefact of the sensor",
@@ -207,7 +207,7 @@ class Sheet:
         for line in lines:
             self.print(line, style)
 
-    def table(self, table: tables.AnyTable) -> None:
+    def table(self, table: AnyTable) -> None:
         """Add an empty line and a table; a narrow terminal goes without columns to spare."""
         self.print()
         columns = [column for column in table.columns if column.text is not None]
@@ -256,24 +256,13 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     name, answer = Path(analysis.session.path).name, analysis.answer
     sheet.print(f"{name}: {answer.sentence}", "bold")
     sheet.print(answer.detail)
-    moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
-    shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
-    if analysis.gaits:
-        shown.append(gait_table(analysis.gaits))
-    if analysis.tracking:
-        shown = [] if analysis.gait.frequency_hz.value is None else shown
-        shown.append(tracking_table(analysis.tracking))
-    if analysis.frequency_response:
-        shown = shown if analysis.tracking else []
-        shown.append(frequency_table(analysis.frequency_response))
-    if analysis.free_motion is not None and analysis.free_motion.joints:
-        shown = _of_motion(analysis.free_motion)
-    if analysis.body is not None:
-        shown.append(tables.body_table(analysis.body))
-    if any(index.value is not None for index in analysis.heterogeneity.values()):
-        shown.append(tables.index_table(analysis.heterogeneity))
-    for table in shown:
+    for table in _tables(analysis):
         sheet.table(table)
+    for part in shown_parts(analysis).values():
+        sheet.print()
+        sheet.print(f"{part.title}:")
+        for table in part.tables:
+            sheet.table(table)
     sheet.print()
     sheet.lines(more_lines(analysis))
     if not analysis.coupling.identifiable:
@@ -288,9 +277,40 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     return sheet.text()
 
 
-def _of_motion(motion: FreeMotion) -> list[tables.AnyTable]:
+def _tables(analysis: Analysis) -> list[AnyTable]:
+    """Return the tables of a session, the joints first."""
+    moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
+    shown: list[AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
+    if analysis.gaits:
+        shown.append(gait_table(analysis.gaits))
+    if analysis.tracking:
+        shown = [] if analysis.gait.frequency_hz.value is None else shown
+        shown.append(tracking_table(analysis.tracking))
+    if analysis.frequency_response:
+        shown = shown if analysis.tracking else []
+        shown.append(frequency_table(analysis.frequency_response))
+    if analysis.free_motion is not None and analysis.free_motion.joints:
+        shown = _of_motion(analysis.free_motion)
+    if analysis.body is not None:
+        shown.append(tables.body_table(analysis.body))
+    if any(index.value is not None for index in analysis.heterogeneity.values()):
+        shown.append(tables.index_table(analysis.heterogeneity))
+    return shown
+
+
+def shown_parts(analysis: Analysis) -> dict[str, Shown]:
+    """Return tables and figures of the parts that other packages add, by name."""
+    if not analysis.more:
+        return {}
+    from ..session.added_parts import shown
+
+    parts = {name: shown(name, result) for name, result in analysis.more.items()}
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def _of_motion(motion: FreeMotion) -> list[AnyTable]:
     """Return the tables of a motion without commands."""
-    shown: list[tables.AnyTable] = [motion_table(motion.joints)]
+    shown: list[AnyTable] = [motion_table(motion.joints)]
     if motion.waves:
         shown.append(wave_table(motion.waves))
     if any(wave.local for wave in motion.waves):

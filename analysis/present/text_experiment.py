@@ -14,6 +14,7 @@ from ..experiment.answer import kick_detail, sweep_detail, sweep_method
 from ..experiment.best_linear import multisine_method
 from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal import SIGNIFICANT
+from ..parts.shown import Column, Table, typical
 from ..results import formats
 from ..results.body import BodyConnection, PredictedTravel
 from ..results.comparison import Change, Comparison
@@ -22,15 +23,7 @@ from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from ..results.formats import scaled
 from ..results.frequency_response import BestLinearJoint
-from .tables import (
-    Column,
-    Table,
-    difference_table,
-    mirror_table,
-    run_table,
-    typical,
-    waveform_table,
-)
+from .tables import difference_table, mirror_table, run_table, waveform_table
 from .text import Sheet, body_detail, unidentified
 
 MOST_CHANGES = 12

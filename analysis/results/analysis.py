@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from .answer import Answer, Artefact, DeadBand
 from .body import BodyPoint, BodyResult, BodyShape, GroundContact
@@ -20,7 +20,12 @@ from .estimate import Estimate, PresentedResult, Provenance, WithInterval
 from .frequency_response import FreeMotion, JointFrequencyResponse, JointTracking
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from .oscillators import ChainCoupling
+
+KEYS_OF_THEIR_OWN = {"json": "keys of their own"}
+"""Marks a field whose values stand beside the others in the JSON, under keys of their own."""
 
 
 @dataclass(frozen=True)
@@ -260,6 +265,8 @@ class Analysis(PresentedResult):
         free_motion: Where no commands were logged: amplitudes, lags and waves of the motion.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
         notes: One sentence each: what was not recorded, does not apply or was assumed.
+        more: Results of parts that other packages add, by name: dataclasses, each under a key of
+            its own in the JSON; plain values of parts that aren't installed.
     """
 
     answer: Answer = field(default_factory=Answer)
@@ -283,6 +290,7 @@ class Analysis(PresentedResult):
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     provenance: Provenance
+    more: dict[str, Any] = field(default_factory=dict[str, Any], metadata=KEYS_OF_THEIR_OWN)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain JSON values.
@@ -290,7 +298,9 @@ class Analysis(PresentedResult):
         An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
         interval in ``lag_ci95``.
         """
-        return dataclasses.asdict(self) | {
+        values = dataclasses.asdict(self)
+        del values["more"]
+        return values | {
             "gait": _record(self.gait) | {"groups": [_record(group) for group in self.gait.groups]},
             "joints": [_record(joint) for joint in self.joints],
             "gaits": [
@@ -312,7 +322,20 @@ class Analysis(PresentedResult):
             ],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
+            **{name: plain_result(result) for name, result in self.more.items()},
         }
+
+
+def plain_result(result: Any) -> Any:
+    """Return a result of nested dataclasses as plain JSON values, each estimate as two keys."""
+    if dataclasses.is_dataclass(result):
+        values = {entry.name: getattr(result, entry.name) for entry in dataclasses.fields(result)}
+        return {key: plain_result(value) for key, value in values.items()} | _estimates(result)
+    if isinstance(result, (tuple, list)):
+        return [plain_result(value) for value in cast("Sequence[Any]", result)]
+    if isinstance(result, dict):
+        return {key: plain_result(value) for key, value in cast("dict[str, Any]", result).items()}
+    return result
 
 
 def interval_key(key: str) -> str:

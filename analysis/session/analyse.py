@@ -22,6 +22,7 @@ from ..segments.answer import Facts, compose
 from ..signals.columns import drag_ratio
 from ..signals.stretch import Options
 from . import parts
+from .added_parts import added_parts, checked
 from .fields import SessionMeasurement, gait_facts
 from .gaits import gait_windows
 from .runs import coupling_of_one_gait
@@ -49,7 +50,8 @@ def measure_session(
     Args:
         without: Names of parts that nothing asks for: ``dead_band`` takes a third of the time of a
             short session, ``body`` two fifths of that of a long one. A motion without commands is
-            known by the body's, which is then measured all the same.
+            known by the body's, which is then measured all the same. Parts of other packages are
+            measured where nothing is left out.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -58,10 +60,12 @@ def measure_session(
     """
     options, remarks = options or Options(), Remarks()
     signals = read_signals(session, options, remarks)
-    chosen = {part.name for part in parts.PARTS} - {*without}
+    added = () if without else added_parts()
+    every = (*parts.PARTS, *added)
+    chosen = {part.name for part in every} - {*without}
     if signals.columns.command:
         chosen -= {parts.FREE_MOTION.name}
-    done = measure(in_order(parts.PARTS, chosen), signals, remarks)
+    done = measure(in_order(every, chosen), signals, remarks)
     session, columns = signals.session, signals.columns
     gait, artefacts, judged = done[parts.GAIT], done[parts.ARTEFACTS], done[parts.JUDGEMENT]
     body, tracked = done.get(parts.BODY, parts.MeasuredBody()), done[parts.TRACKING]
@@ -93,6 +97,7 @@ def measure_session(
         tracking=tracked.joints,
         oscillators=done[parts.OSCILLATORS],
         notes=remarks.notes,
+        more={part.name: checked(part, done[part]) for part in added if done[part] is not None},
     )
     facts = Facts(
         analysis.gait,

@@ -375,7 +375,7 @@ PARTS: tuple[Part[Any], ...] = (
     CLOSED_LOOP,
     OSCILLATORS,
 )
-"""All parts. Of those that could be next, the first is measured: remarks come in this order."""
+"""All parts of this package. Of those that could be next, the first is measured first."""
 
 
 def _warn_flags(
