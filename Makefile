@@ -134,8 +134,9 @@ bench: $(READY)  ## speed, as ratios against named peers, onto one page (QUICK=1
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -E -b html docs docs/_build/html
 
-schemas: $(READY)  ## the JSON Schemas of the results, which ship with the package
+schemas: $(READY)  ## the JSON Schemas of the results, which ship with the package; the tree in CONTRIBUTING
 	$(BIN)/python docs/reference_pages.py
+	$(BIN)/python docs/tree.py
 
 pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python studies/pictures.py $(DEMO)

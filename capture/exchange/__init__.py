@@ -1,1 +1,1 @@
-"""Logs of other makes, in and out: CAN traces, CSV."""
+"""Logs of other makes, in and out: CAN traces, tables, arrays, data sets for learning."""

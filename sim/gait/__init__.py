@@ -1,1 +1,4 @@
-"""Gaits: commands of the joints over time. :mod:`.sim.gait.contract` defines their interface."""
+"""Gaits: commands of the joints over time.
+
+:mod:`.sim.gait.contract` defines their interface.
+"""
