@@ -127,10 +127,10 @@ def test_each_joint_has_the_energies_of_its_own_samples_in_each_cycle(written):
     clipped = sum(one.electrical.abs_j.sum() for one in found.values())
     assert sums["el_abs"] == pytest.approx(clipped)
     assert all(one.sampled == {"mechanical", "electrical"} for one in found.values())
-    one = energy.Energies(None, found["joint01"].electrical)
-    assert one.per_cycle("net") is None
-    assert one.per_cycle("el") is found["joint01"].electrical.net_j
-    assert sorted(energy.whole_robot([one])) == ["el", "el_abs", "el_clipped"]
+    energies = energy.Energies(None, found["joint01"].electrical)
+    assert energies.per_cycle("net") is None
+    assert energies.per_cycle("el") is found["joint01"].electrical.net_j
+    assert sorted(energy.whole_robot([energies])) == ["el", "el_abs", "el_clipped"]
 
 
 def test_a_falsified_sensor_takes_its_own_kind_of_energy_of_its_own_joint(written):
@@ -216,7 +216,7 @@ def test_the_result_has_each_cycle_from_the_sessions_start(written):
     assert result.stop_s == (3.5, 5.5, 7.5, 9.5)
     assert result.electrical == "simulated"
     assert said == []
-    assert [one.name for one in result.joints] == list(NAMES)
+    assert [joint.name for joint in result.joints] == list(NAMES)
     first = result.joints[0]
     assert first.net_j == tuple(found["joint01"].mechanical.net_j)
     assert first.el_clipped_j == tuple(found["joint01"].electrical.plus_j)

@@ -65,10 +65,10 @@ def _bomb(data, rng):
 def _odd_files(data, rng):
     """Name other files, or the same ones more than once."""
     text = data.decode("utf-8", "replace")
-    found = re.search(r"(?m)^  relative_file_paths:\n((?:  - .*\n)+)", text)
-    if found is None:
+    match = re.search(r"(?m)^  relative_file_paths:\n((?:  - .*\n)+)", text)
+    if match is None:
         return data
-    rows = found[1].splitlines(keepends=True)
+    rows = match[1].splitlines(keepends=True)
     others = ["/etc/passwd", "../x.mcap", "metadata.yaml", ".", "''", "/dev/zero", "a\\0b", "\\e"]
     more = [
         rows * rng.choice([2, 50, 3000]),
@@ -79,7 +79,7 @@ def _odd_files(data, rng):
         rows[1:],
         [],
     ]
-    return (text[: found.start(1)] + "".join(rng.choice(more)) + text[found.end(1) :]).encode()
+    return (text[: match.start(1)] + "".join(rng.choice(more)) + text[match.end(1) :]).encode()
 
 
 # -- databases -----------------------------------------------------------------------------
@@ -270,7 +270,7 @@ def _rebuilt(records):
 
 
 def _of(records, op):
-    return [one for one in records if one[0].get(b"op", b"\0")[0] == op]
+    return [record for record in records if record[0].get(b"op", b"\0")[0] == op]
 
 
 @cache

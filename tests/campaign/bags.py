@@ -53,16 +53,16 @@ def bag_bases(folder):
 
 def _fill(bag, first=0, count=120):
     """Joints in each of the types that they are found in, and a word."""
-    own = Filler(bag)
+    filler = Filler(bag)
     for k, tick in enumerate(ticks(3.0, 50)):
         if not first <= k < first + count:
             continue
-        own.state(*tick)
-        own.controller(*tick)
-        own.dynamic(*tick)
+        filler.state(*tick)
+        filler.controller(*tick)
+        filler.dynamic(*tick)
         if k % 5 == 0:
-            own.trajectory(*tick, count=3)
-            own.array(*tick)
+            filler.trajectory(*tick, count=3)
+            filler.array(*tick)
             word = message(bag.store, "std_msgs/msg/String", data=f"word {k}")
             bag.write("/word", tick[0], word)
 

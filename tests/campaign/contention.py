@@ -39,7 +39,9 @@ def run(seed, stage):
             result.failures.append(f"recorder: exit code {code}: {errors[-300:]}")
         for one, report in zip(sending, reports, strict=True):
             result.failures += check_kept(folder, one, report["accepted"])
-        accepted, refused = (sum(one[key] for one in reports) for key in ("accepted", "refused"))
+        accepted, refused = (
+            sum(report[key] for report in reports) for key in ("accepted", "refused")
+        )
         result.figures = {
             "n_accepted": accepted,
             "n_refused": refused,

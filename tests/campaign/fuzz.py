@@ -87,12 +87,12 @@ def make_case(seed, bases, scratch, part="mutated"):
     """Return the case of a seed of a part of the campaign."""
     rng, weights = random.Random(seed), WEIGHTS[part]
     kind = rng.choices(list(weights), list(weights.values()))[0]
-    base = rng.choice([one for one in bases if one.kind == kind])
+    base = rng.choice([base for base in bases if base.kind == kind])
     lines = COMMANDS[kind]
     line = rng.choices([text for _, text in lines], [weight for weight, _ in lines])[0]
     files = dict(base.files)
     if "gait0.mcap" in line:
-        gait = next(one for one in bases if one.name == "gait.mcap")
+        gait = next(base for base in bases if base.name == "gait.mcap")
         files["gait0.mcap"] = gait.files["gait.mcap"]
     names = [rng.choice(base.mutable) for _ in range(rng.choice([1, 1, 1, 2]))]
     for name in dict.fromkeys(names):  # in this order, whatever the hash seed of the process is
@@ -224,7 +224,7 @@ def minimise(case, kind, bases, fresh, seconds=40.0):
     Unneeded files are left out, unneeded faults are undone, then parts are cut out by halves.
     """
     deadline = time.monotonic() + seconds
-    originals = {(one.name, path): data for one in bases for path, data in one.files.items()}
+    originals = {(base.name, path): data for base in bases for path, data in base.files.items()}
 
     def fails(files):
         tried = Case(case.words, files, case.ended_after_s)

@@ -279,10 +279,10 @@ def stop_robot(rng, stage):
         kept = Counter(_frames(folder / "run.mcap"))
         # The recorder connected after the listener: from the first command on it has all.
         first = next((k for k, row in enumerate(heard) if 0 <= row[1] - COMMAND < JOINTS), 0)
-        wanted = Counter((row[1], row[2]) for row in heard[first:])
-        if lost := (wanted - kept).total():
-            result.failures.append(f"lost: {lost} of {wanted.total()} frames of the bus")
-        result.figures["n_frames"] = wanted.total()
+        counter = Counter((row[1], row[2]) for row in heard[first:])
+        if lost := (counter - kept).total():
+            result.failures.append(f"lost: {lost} of {counter.total()} frames of the bus")
+        result.figures["n_frames"] = counter.total()
     return result
 
 

@@ -54,13 +54,13 @@ def lay_out(folder, stage):
 
 def whole_outputs(folder):
     """Return faults of the files under their final names."""
-    found = check_output(folder)
+    output = check_output(folder)
     for suffix, end in END.items():
         for path in folder.glob(f"new*{suffix}"):
             data = path.read_bytes()
             if not data or end not in data[-100:]:
-                found.append(f"output: {path.name} is cut short")
-    return found
+                output.append(f"output: {path.name} is cut short")
+    return output
 
 
 def run(seed, stage):
@@ -76,7 +76,9 @@ def run(seed, stage):
         outcome = run_command(words, folder, end_after_s=rng.random() ** 2 * 1.2, end_by=by)
         result.add(outcome)
         if by == signal.SIGINT:  # before the command has begun Python itself answers
-            result.failures = [one for one in result.failures if not one.endswith("[?]")]
+            result.failures = [
+                failure for failure in result.failures if not failure.endswith("[?]")
+            ]
         leaves_a_log = recording and (folder / "new.mcap.wal").exists()
         result.failures += whole_outputs(folder)
         if not outcome.killed:

@@ -226,16 +226,22 @@ def remake_log(data, rng, scratch):
         for number, (schema, channel, message) in enumerate(reader.iter_messages()):
             remake.add(number, schema, channel, message, hit=rng.randrange(every) == 0)
         with contextlib.suppress(McapError):
-            for one in reader.iter_metadata():
-                facts = dict(one.metadata)
+            for attachment in reader.iter_metadata():
+                facts = dict(attachment.metadata)
                 if "names" in faults:
                     facts = {k: rng.choice([v, *WORDS, *NUMBERS]) for k, v in facts.items()}
-                writer.add_metadata(one.name, facts)
-            for one in reader.iter_attachments():
-                content = one.data
+                writer.add_metadata(attachment.name, facts)
+            for attachment in reader.iter_attachments():
+                content = attachment.data
                 if "names" in faults and rng.random() < 0.5:
                     content = mutate_text(content, rng)
-                writer.add_attachment(0, one.create_time, one.name, one.media_type, content)
+                writer.add_attachment(
+                    0,
+                    attachment.create_time,
+                    attachment.name,
+                    attachment.media_type,
+                    content,
+                )
         writer.finish()
     return target.read_bytes()
 

@@ -68,9 +68,9 @@ def zip_of_stream(name, stream, *, declared, twins=0):
     local = struct.pack("<IHHHHHIIIHH", 0x04034B50, *fixed, len(name), 0) + name + stream
     names = [name, *(b"%d.npy" % k for k in range(twins))]
     central = b"".join(
-        struct.pack("<IHHHHHHIIIHHHHHII", 0x02014B50, 20, *fixed, len(each), 0, 0, 0, 0, 0, 0)
-        + each
-        for each in names
+        struct.pack("<IHHHHHHIIIHHHHHII", 0x02014B50, 20, *fixed, len(name), 0, 0, 0, 0, 0, 0)
+        + name
+        for name in names
     )
     count = len(names)
     end = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, count, count, len(central), len(local), 0)

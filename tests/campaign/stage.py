@@ -53,7 +53,7 @@ class Stage:
     def _warm(self):
         """Run every command line once on whole files, and import here what it imported."""
         cases, seen = [], set()
-        firsts = {(one.kind, Path(one.name).suffix): one for one in reversed(self.bases)}
+        firsts = {(base.kind, Path(base.name).suffix): base for base in reversed(self.bases)}
         for (kind, suffix), base in firsts.items():
             files = base.files | {"gait0.mcap": self.files_of("lz4.mcap")["lz4.mcap"]}
             for _, line in COMMANDS[kind]:
@@ -83,7 +83,7 @@ class Stage:
 
     def files_of(self, name):
         """Return the files of a base."""
-        return next(one for one in self.bases if one.name == name and one.kind == "log").files
+        return next(base for base in self.bases if base.name == name and base.kind == "log").files
 
     def close(self):
         """Remove the folder."""

@@ -27,8 +27,8 @@ pytestmark = pytest.mark.nightly
 
 def shows_the_conclusions_of_the_study(folder, _):
     verdicts = evaluate(results_of(folder / "rows.parquet"))
-    assert {one.conclusion.name for one in verdicts if one.holds is None} == NEEDS_MORE
-    assert [one for one in verdicts if one.holds is False] == []
+    assert {verdict.conclusion.name for verdict in verdicts if verdict.holds is None} == NEEDS_MORE
+    assert [verdict for verdict in verdicts if verdict.holds is False] == []
     page = (folder / "study.md").read_text()
     for name in (one.name for one in CONCLUSIONS):
         assert f"`{name}`" in page

@@ -78,9 +78,9 @@ def faults(page: str, known: SpellChecker) -> Iterator[str]:
 
 def dictionary() -> SpellChecker:
     """Return the words that are spelt right, the project's own among them."""
-    known = SpellChecker()
-    known.word_frequency.load_words(WORDS.read_text().split())
-    return known
+    checker = SpellChecker()
+    checker.word_frequency.load_words(WORDS.read_text().split())
+    return checker
 
 
 def main() -> int:

@@ -243,7 +243,7 @@ def looked_at(path):
     tests = {name for name in named if name.startswith("test_")}
     tainted = {name for name, one in named.items() if reads_a_clock(one)}
     others = [one for one in body if one not in named.values()]
-    wrong = {"the module" for one in others if reads_a_clock(one)}
+    wrong = {"the module" for other in others if reads_a_clock(other)}
     while True:
         users = {
             name
@@ -279,7 +279,7 @@ def test_no_other_test_reads_a_clock():
         if MAY_READ_A_CLOCK.search(text):
             of_clock, faults = looked_at(path)
             marked += [f"{name}::{one}" for one in of_clock]
-            wrong += [f"{name}: {one}" for one in sorted(faults)]
+            wrong += [f"{name}: {fault}" for fault in sorted(faults)]
     assert not wrong
     assert 0 < len(marked) <= MOST_CLOCK_TESTS
 

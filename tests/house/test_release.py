@@ -30,8 +30,8 @@ def pins():
 
 
 def test_the_bill_has_every_package_of_the_lock_with_its_files(bill):
-    found = Counter((one["name"], one["version"]) for one in bill["components"])
-    assert found == Counter(
+    counter = Counter((one["name"], one["version"]) for one in bill["components"])
+    assert counter == Counter(
         (re.sub(r"[._]", "-", pin.name), next(iter(pin.specifier)).version) for pin in pins()
     )
     files = [one["externalReferences"][0]["hashes"] for one in bill["components"]]

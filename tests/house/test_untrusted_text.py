@@ -228,7 +228,7 @@ def test_pages_have_no_markup_from_names(folder, run, command):
     tags.feed(text)
     assert raw(text) <= {"\t"}
     assert "alert(1)" in text
-    assert not [one for tag, attrs in tags.found for one in attrs if one.startswith("on")]
+    assert not [attr for tag, attrs in tags.found for attr in attrs if attr.startswith("on")]
     assert not [a for _, a in tags.found if "javascript:" in (a.get("href") or "")]
     assert text.count("<script>alert") == 0
 

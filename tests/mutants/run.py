@@ -185,7 +185,7 @@ class Tree:
 
     def run(self, tests):
         """Run fast tests in the copy; return the outcome, and the time [s]."""
-        names = [one.relative_to(ROOT) for one in tests]
+        names = [test.relative_to(ROOT) for test in tests]
         began = time.monotonic()
         code = self.code_of("-m", "not slow and not clock", *names, limit_s=LIMIT_S)
         outcome = {None: "limit", 0: "passed", 5: "passed"}.get(code, "failed")
@@ -234,7 +234,7 @@ def summary(rows):
     """Return the share that was killed, by part, and the survivors."""
     lines = ["| part | mutants | killed |", "|---|---|---|"]
     for part, roots in PARTS.items():
-        own = [row for row in rows if any(row["mutant"]["path"].startswith(one) for one in roots)]
+        own = [row for row in rows if any(row["mutant"]["path"].startswith(root) for root in roots)]
         lines.append(f"| {part} | {len(own)} | {sum(row['killed'] for row in own)} |")
     killed = sum(row["killed"] for row in rows)
     lines.append(f"| all | {len(rows)} | {killed}, {killed / max(1, len(rows)):.0%} |")

@@ -43,7 +43,7 @@ def test_draws_are_one_a_place_and_the_same_for_a_seed(tree):
 def test_the_tests_that_import_a_module_come_first():
     first, *others = run.tests_of("capture/log/wal/reader.py")
     assert "undulog.capture.log.wal.reader" in first.read_text()
-    assert {one.parent for one in (first, *others)} == {ROOT / "tests" / "capture/log/wal"}
+    assert {other.parent for other in (first, *others)} == {ROOT / "tests" / "capture/log/wal"}
 
 
 def test_a_run_goes_on_and_counts_what_survived(tmp_path):

@@ -190,7 +190,7 @@ class Recorded:
 
     def statics(self, entity, component):
         """Values of a static component, a list each."""
-        own = (one for one in self._chunks if one.entity_path == entity and one.is_static)
+        own = (chunk for chunk in self._chunks if chunk.entity_path == entity and chunk.is_static)
         batches = (chunk.to_record_batch() for chunk in own)
         return [b.column(component).to_pylist()[0] for b in batches if component in b.schema.names]
 

@@ -67,7 +67,10 @@ def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened
     expected = {"name": "scenario.toml: servo_of.joint02.stall_torque", "a": None, "b": "0.1"}
     assert expected in changed
     differences = report["comparison"]["differences"]
-    found = {(one["place"], one["quantity"]): one["difference"] for one in differences}
+    found = {
+        (difference["place"], difference["quantity"]): difference["difference"]
+        for difference in differences
+    }
     low, high = found["joint02", "lag"]["ci95"]
     assert 0.0 < low < high  # a weak servo lags
     again(room, tmp_path / "weak.mcap", "--set", change, "--force")

@@ -121,7 +121,7 @@ def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analy
         rest_p=0.4,
         draws=200,
     )
-    values = {one.name: getattr(analysis, one.name) for one in dataclasses.fields(analysis)}
+    values = {field.name: getattr(analysis, field.name) for field in dataclasses.fields(analysis)}
     modelled = ModelledAnalysis(**values, null_model=test)
     layer = saved(session, [modelled.save(tmp_path / "held.json")])
     assert layer.analysis == modelled

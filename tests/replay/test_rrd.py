@@ -224,9 +224,9 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
         "/joint_sample_offset": (names, "s", np.tile(offset, (50, 1))),
     }
     write_topics(tmp_path / "a.mcap", t, topics, robot=snake25)
-    found = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
-    np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
-    shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
+    back = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
+    np.testing.assert_array_equal(back.times("/joints/measured"), t - START)
+    shown = np.radians(rows(back.column("/joints/measured", "Angle:degrees")))
     assert np.isnan(shown[0, 1:]).all()  # none of them was sampled before
     assert_drawn(shown[1:], np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25)))
 
@@ -241,10 +241,10 @@ def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_p
     }
     write_topics(tmp_path / "a.mcap", t, topics, session_id="")
     written = converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
-    found = read_back(written.path)
-    right = rows(found.column("/joints/measured/right", "Angle:degrees"))
+    back = read_back(written.path)
+    right = rows(back.column("/joints/measured/right", "Angle:degrees"))
     assert_drawn(np.radians(right), np.arange(1.0, 60.0, 2.0)[:, None])
-    assert len(found.column("/signals/gripper/state", "Scalars:scalars")) == 60
+    assert len(back.column("/signals/gripper/state", "Scalars:scalars")) == 60
     assert [signal.title for signal in written.content.signals] == ["gripper/state [m]"]
 
 
@@ -263,7 +263,7 @@ def test_rerun_opens_our_sessions_itself_with_the_joints_named(
     rerun_command("rrd", "verify", path)
     printed = rerun_command("rrd", "print", "-vvv", "--entity", "/joint_states/position", path)
     assert ", ".join(names[:10]) in printed  # it cuts long lists short
-    found = read_back(path)
-    assert found.column("/joint_states/position", "SeriesLines:names")[0] == names
-    shown = rows(found.column("/joint_states/position", "Scalars:scalars"))
+    back = read_back(path)
+    assert back.column("/joint_states/position", "SeriesLines:names")[0] == names
+    shown = rows(back.column("/joint_states/position", "Scalars:scalars"))
     np.testing.assert_array_equal(shown, truth.position)

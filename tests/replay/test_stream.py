@@ -147,7 +147,9 @@ def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long
     assert any("drawn anew" in note and "/joint_temperature" in note for note in notes)
     ids = {identity for _, identity in received.stores}
     assert ids == {recording_id("long"), recording_id("long/anew")}
-    last = max({one for one in received.entities if one.startswith("/signals/joint_temperature")})
+    last = max(
+        {entity for entity in received.entities if entity.startswith("/signals/joint_temperature")}
+    )
     names = received.static(last, "SeriesLines:names")
     assert "joint25" in names
     at_s = received.times(last) / NS

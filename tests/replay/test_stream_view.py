@@ -218,6 +218,6 @@ def test_who_looks_at_the_served_session_late_gets_its_beginning(view, long_file
         shown.client.set_time("session_time", duration=1.0, play_state="paused")
         until(lambda: glows(shown.picture(rgb, body)) > 300)
         (recording,) = shown.client.get_state().recordings
-        spans = {one.name: (one.start, one.end) for one in recording.timelines}
+        spans = {timeline.name: (timeline.start, timeline.end) for timeline in recording.timelines}
         assert spans["session_time"][0] == 0
         assert spans["session_time"][1] >= round((LONG_S - 0.2) * 1e9)

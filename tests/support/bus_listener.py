@@ -17,7 +17,9 @@ import cantools
 def main():
     """Listen until SIGTERM."""
     port, channel, database, output = sys.argv[1:]
-    messages = {one.frame_id: one for one in cantools.database.load_file(database).messages}
+    messages = {
+        message.frame_id: message for message in cantools.database.load_file(database).messages
+    }
     going = True
 
     def end(_number, _frame):

@@ -43,7 +43,7 @@ def at(tick):
 
 
 def timing_of(health, topic="/joint_states"):
-    (found,) = [each.timing for each in health.series if each.topic == topic]
+    (found,) = [series.timing for series in health.series if series.topic == topic]
     return found
 
 

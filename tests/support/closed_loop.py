@@ -106,7 +106,7 @@ def open_loop(folder, m, held_out=()):
 
 def base_response(experiment):
     """Return the yaw joints' response to the gait: gain exp(-j lag), shape (m,)."""
-    yaw = [one for one in experiment.sessions[0].joints if one.gain.value is not None]
+    yaw = [joint for joint in experiment.sessions[0].joints if joint.gain.value is not None]
     return np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
 
 

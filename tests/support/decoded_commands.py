@@ -15,8 +15,8 @@ MESSAGES = {message.frame_id: message for message in DATABASE.messages}
 def on_the_bus(command):
     """Return the angles in the frames of a command [rad]."""
     decoded = [
-        MESSAGES[int(one["id_flags"])].decode(bytes(one["data"][: one["dlc"]]))
-        for one in ENCODER.frames(command)
+        MESSAGES[int(frame["id_flags"])].decode(bytes(frame["data"][: frame["dlc"]]))
+        for frame in ENCODER.frames(command)
     ]
     assert len(decoded) == len(command)
     return np.radians([one["position"] for one in decoded])

@@ -115,9 +115,9 @@ def serve_robot(robot):
             end = rest.rfind(b">") + 1
             whole, rest = rest[:end], rest[end:]
             for text in re.findall(rb"<[^>]*>", whole):
-                if found := FRAME.match(text):
-                    data = bytes(int(byte, 16) for byte in found[3].split())
-                    robot.take(int(found[1], 16), data)
+                if match := FRAME.match(text):
+                    data = bytes(int(byte, 16) for byte in match[3].split())
+                    robot.take(int(match[1], 16), data)
                 elif b"open" in text or b"rawmode" in text:
                     client.sendall(b"< ok >")
                     raw = raw or b"rawmode" in text

@@ -26,14 +26,25 @@ def rewrite(source, path, **options):
         writer = Writer(out, **options)
         writer.start("ros2", "another make")
         schemas, channels = {}, {}
-        for kind, channel, one in reader.iter_messages():
+        for kind, channel, attachment in reader.iter_messages():
             if kind.id not in schemas:
                 schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
             if channel.id not in channels:
                 facts = (channel.message_encoding, schemas[kind.id], channel.metadata)
                 channels[channel.id] = writer.register_channel(channel.topic, *facts)
-            times = (one.log_time, one.data, one.publish_time, one.sequence)
+            times = (
+                attachment.log_time,
+                attachment.data,
+                attachment.publish_time,
+                attachment.sequence,
+            )
             writer.add_message(channels[channel.id], *times)
-        for one in reader.iter_attachments():
-            writer.add_attachment(0, one.create_time, one.name, one.media_type, one.data)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                0,
+                attachment.create_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
         writer.finish()

@@ -160,12 +160,12 @@ class ForgettingDisk:
 
     def after(self, loss):
         """Rebuild in a new folder what is there after a loss of power, and return that folder."""
-        found = Path(tempfile.mkdtemp(prefix=f"{loss.name.lower()}-", dir=self._place))
+        path = Path(tempfile.mkdtemp(prefix=f"{loss.name.lower()}-", dir=self._place))
         if loss is Loss.EVERYTHING:
-            self._rebuild_synced(self.root.stat().st_ino, found)
+            self._rebuild_synced(self.root.stat().st_ino, path)
         else:
-            self._rebuild_named(self.root, found)
-        return found
+            self._rebuild_named(self.root, path)
+        return path
 
     def _stored(self, kind, inode):
         return self._shadow / kind / str(inode)

@@ -17,9 +17,9 @@ def mutable_dataclasses(package):
     return {
         name
         for module in modules
-        for name, one in vars(module).items()
-        if isinstance(one, type)
-        and dataclasses.is_dataclass(one)
-        and one.__module__ == module.__name__
-        and not one.__dataclass_params__.frozen
+        for name, var in vars(module).items()
+        if isinstance(var, type)
+        and dataclasses.is_dataclass(var)
+        and var.__module__ == module.__name__
+        and not var.__dataclass_params__.frozen
     }

@@ -118,7 +118,7 @@ class Stage:
     @property
     def command_lines(self):
         """Return the commands among the received frames."""
-        return [one for one in self.lines if (one["name"] or "").endswith("_command")]
+        return [line for line in self.lines if (line["name"] or "").endswith("_command")]
 
     @property
     def longest_gap_s(self):
@@ -128,8 +128,8 @@ class Stage:
         """
         lines = self.lines
         first_s = self.command_lines[0]["t_s"]
-        replies = [one for one in lines if (one["name"] or "").endswith("_state")]
-        times_s = [[one["t_s"], one["bus_s"]] for one in replies if one["t_s"] >= first_s]
+        replies = [line for line in lines if (line["name"] or "").endswith("_state")]
+        times_s = [[reply["t_s"], reply["bus_s"]] for reply in replies if reply["t_s"] >= first_s]
         return float(np.diff(times_s, axis=0).max())
 
     def _heard_of(self, words):
@@ -239,11 +239,11 @@ class Driving:
 def commands_of(lines):
     """Return each joint's commands: name to (monotonic times [s], angles [rad])."""
     found = {}
-    for one in lines:
-        if (one["name"] or "").endswith("_command"):
-            name = one["name"].removesuffix("_command")
-            angle = math.radians(one["signals"]["position"])
-            found.setdefault(name, []).append((one["t_s"], angle))
+    for line in lines:
+        if (line["name"] or "").endswith("_command"):
+            name = line["name"].removesuffix("_command")
+            angle = math.radians(line["signals"]["position"])
+            found.setdefault(name, []).append((line["t_s"], angle))
     return {name: tuple(np.array(rows).T) for name, rows in found.items()}
 
 
@@ -292,8 +292,8 @@ class Written:
                     frames = np.frombuffer(bytes(message.data), FRAME)
                     ours = frames[frames["dir"] != 0]
                     self.sent += [
-                        (int(one["id_flags"]), one["data"][: one["dlc"]].tobytes().hex())
-                        for one in ours
+                        (int(our["id_flags"]), our["data"][: our["dlc"]].tobytes().hex())
+                        for our in ours
                     ]
                     self.sent_ns += ours["t_host_ns"].tolist()
 
@@ -322,7 +322,9 @@ def check_session(path, lines, *, max_rate=MAX_RATE, lockstep=False):
         given = np.array([row[name] for _, row in written.commands])
         assert len(given) == len(angle), (name, given[-5:], angle[-5:])
         assert np.abs(given - angle).max(initial=0.0) <= STEP / 2 * (1 + 1e-6), name
-    on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
+    on_bus = [
+        (line["id"], line["data"]) for line in lines if (line["name"] or "").endswith("_command")
+    ]
     assert written.sent == on_bus  # bit by bit, and so nothing came after the end
     if not lockstep:
         check_true_rates(written, lines, max_rate=max_rate)
@@ -337,7 +339,7 @@ def check_true_rates(written, lines, *, max_rate=MAX_RATE):
     returns the shortest time between two commands [s].
     """
     sent_ns = {}
-    names = [one["name"] for one in lines if (one["name"] or "").endswith("_command")]
+    names = [line["name"] for line in lines if (line["name"] or "").endswith("_command")]
     for name, at_ns in zip(names, written.sent_ns, strict=True):
         sent_ns.setdefault(name.removesuffix("_command"), []).append(at_ns)
     shortest_s = math.inf

@@ -32,8 +32,8 @@ class Recorder:
                 for _, _, m in reader.iter_messages()
             ]
         self.feed = LiveFeed(socket_path, **options)
-        for one in self.definitions:
-            self.feed.define(one)
+        for definition in self.definitions:
+            self.feed.define(definition)
 
     def connect(self):
         wait_for(lambda: self.feed.connected, each=self.feed.pump)

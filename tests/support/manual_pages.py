@@ -62,15 +62,15 @@ def read_page(name: str) -> str:
 
 def steps(page: str) -> list[File | Command]:
     """Return what the page makes the reader do, in order."""
-    found: list[File | Command] = []
+    files: list[File | Command] = []
     for kind, body in _BLOCK.findall(page):
         if kind == "console":
             for part in ("\n" + body).split("\n$ ")[1:]:
                 line, _, shown = part.partition("\n")
-                found.append(Command(line.partition("   #")[0].strip(), shown.strip()))
+                files.append(Command(line.partition("   #")[0].strip(), shown.strip()))
         elif caption := _CAPTION.match(body):
-            found.append(File(caption[1], body[caption.end() :], bool(caption[2])))
-    return found
+            files.append(File(caption[1], body[caption.end() :], bool(caption[2])))
+    return files
 
 
 def minutes(page: str) -> float:

@@ -189,6 +189,8 @@ def _answers(page):
 def listening(*ports):
     """Return address, as the kernel prints it, and port of sockets that listen at some ports."""
     tables = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
-    lines = [line for one in tables if one.exists() for line in one.read_text().splitlines()[1:]]
+    lines = [
+        line for table in tables if table.exists() for line in table.read_text().splitlines()[1:]
+    ]
     local = [line.split()[1].split(":") for line in lines if line.split()[3] == "0A"]
     return {(address, int(port, 16)) for address, port in local if int(port, 16) in ports}

@@ -41,8 +41,8 @@ def opcodes_so_far(path):
 def decoded_of(path, topics=None):
     """Topic, log time and content of all messages of one file, by mcap-ros2-support."""
     with path.open("rb") as stream:
-        found = make_reader(stream, decoder_factories=[DecoderFactory()])
-        rows = found.iter_decoded_messages(topics)
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        rows = reader.iter_decoded_messages(topics)
         return [(channel.topic, message.log_time, content) for _, channel, message, content in rows]
 
 
@@ -72,4 +72,8 @@ def chunks_of(path, topic):
     """Chunk indexes of one file that list messages of a topic."""
     summary = summary_of(path)
     (key,) = (key for key, channel in summary.channels.items() if channel.topic == topic)
-    return [each for each in summary.chunk_indexes if key in each.message_index_offsets]
+    return [
+        chunk_index
+        for chunk_index in summary.chunk_indexes
+        if key in chunk_index.message_index_offsets
+    ]

@@ -231,7 +231,7 @@ class Filler:
         """Points that are due HOLD_S after the stamp and each 10 ms later."""
         store = self.bag.store
         steps = [round(HOLD_S * 1e9) + k * 10**7 for k in range(count)]
-        points = [point(store, commanded(t_s + each * 1e-9), each) for each in steps]
+        points = [point(store, commanded(t_s + step * 1e-9), step) for step in steps]
         head = header(store, t_ns if stamped else 0)
         names = list(NAMES)
         sample = message(store, TRAJECTORY, header=head, joint_names=names, points=points)
@@ -245,8 +245,8 @@ def filling(write, seconds=10.0, rate=100):
     """A fill for :func:`write_bag`; ``write`` gets a filler and the times of each tick."""
 
     def fill(bag):
-        own = Filler(bag)
+        filler = Filler(bag)
         for tick in ticks(seconds, rate):
-            write(own, *tick)
+            write(filler, *tick)
 
     return fill

@@ -162,9 +162,12 @@ def stated(signals: Signals) -> Said:
     )
     different = (
         *(Different(one.joint, one.quantity, one.deviation, None) for one in answer.stand_out),
-        *(Different(one.joint, one.quantity, one.change, one.from_s) for one in answer.changes),
+        *(
+            Different(change.joint, change.quantity, change.change, change.from_s)
+            for change in answer.changes
+        ),
         *(Different(one.joint, "motion", one.amplitude_rad, None) for one in answer.extra),
-        *(Different(one.joint, "rest", one.offset_rad, None) for one in answer.rests),
+        *(Different(rest.joint, "rest", rest.offset_rad, None) for rest in answer.rests),
         *(Different(one.joint, one.quantity, _beyond(one), None) for one in answer.apart),
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
@@ -177,7 +180,9 @@ def stated(signals: Signals) -> Said:
         not_decided=not_decided,
         sentence=answer.sentence,
         doubted=tuple(
-            one.joint for one in measured.analysis.artefacts if one.falsifies("position")
+            artefact.joint
+            for artefact in measured.analysis.artefacts
+            if artefact.falsifies("position")
         ),
     )
 

@@ -39,11 +39,11 @@ def write_bag(log, path):
         groups = [[j] for j in range(robot.m)] if robot.per_servo else [list(range(robot.m))]
         for group in groups:
             times = robot.t_s[:, group[0]]
-            columns = [None if one is None else one[:, group] for one in (position, *others)]
+            columns = [None if other is None else other[:, group] for other in (position, *others)]
             if robot.per_servo:  # a message that was lost is not there
                 kept = np.isfinite(position[:, group[0]])
                 times = times[kept]
-                columns = [None if one is None else one[kept] for one in columns]
+                columns = [None if column is None else column[kept] for column in columns]
             rows += _messages(number, [robot.names[j] for j in group], times, columns)
     rows.sort(key=lambda row: row[:2])
     with path.open("wb") as file:

@@ -55,7 +55,7 @@ def judge(output, statement, truth, robot):
     """Judge the statement of an output against the planted truth."""
     if statement.error:
         return Judgement((f"error: {statement.error}",))
-    planted = {robot.names[one.joint]: one for one in truth.joints}
+    planted = {robot.names[joint.joint]: joint for joint in truth.joints}
     expected = [name for name, one in planted.items() if _must_name(output, one)]
     first = named_in(statement.text, robot.names)
     listed = [*(statement.not_following or ()), *(statement.stands_out or ())]

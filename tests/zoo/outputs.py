@@ -141,11 +141,11 @@ def detected(log):
 
 
 def _named(faults):
-    return {one.joint: Named(frozenset(one.kinds), one.since_s) for one in faults}
+    return {fault.joint: Named(frozenset(fault.kinds), fault.since_s) for fault in faults}
 
 
 def _changed(changes):
-    return {one.joint: frozenset({one.quantity}) for one in changes}
+    return {change.joint: frozenset({change.quantity}) for change in changes}
 
 
 def _compared(healthy, path, options):
@@ -158,8 +158,8 @@ def _compared(healthy, path, options):
 
 
 def _heading(page):
-    found = re.search(r'<h1\b[^>]*\bid="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
-    return "" if found is None else found[1]
+    match = re.search(r'<h1\b[^>]*\bid="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
+    return "" if match is None else match[1]
 
 
 def _plain(markup):

@@ -163,7 +163,7 @@ def _(robot, rng, j):
     count = min(robot.m // 3, robot.m - 4)
     joints = sorted(rng.permutation(robot.m)[:count].tolist())
     acts = np.ones(len(robot.t_s), dtype=bool)
-    rest = (np.full(len(acts), robot.bias[one]) for one in joints)
-    made = [_dead(robot, one, acts, None, at) for one, at in zip(joints, rest, strict=True)]
+    rest = (np.full(len(acts), robot.bias[joint]) for joint in joints)
+    made = [_dead(robot, joint, acts, None, at) for joint, at in zip(joints, rest, strict=True)]
     changes = tuple(change for (change,), _ in made)
-    return changes, Truth(tuple(one for _, truth in made for one in truth.joints))
+    return changes, Truth(tuple(joint for _, truth in made for joint in truth.joints))

@@ -48,10 +48,10 @@ def test_a_fault_touches_no_joint_but_those_it_names(name):
         healthy, faulty = (record(robot, one, 1).position for one in ((), changes))
         differs = ~(np.isclose(healthy, faulty, rtol=0, atol=1e-12)).all(axis=0)
         assert np.flatnonzero(differs).tolist() == sorted(one.joint for one in truth.joints)
-        for one in truth.joints:
-            assert one.names <= one.allowed
-            assert one.names or one.stands_out
-            assert one.since_s is None or 0 < one.since_s < robot.duration_s
+        for joint in truth.joints:
+            assert joint.names <= joint.allowed
+            assert joint.names or joint.stands_out
+            assert joint.since_s is None or 0 < joint.since_s < robot.duration_s
 
 
 def test_a_healthy_robot_answers_as_drawn():

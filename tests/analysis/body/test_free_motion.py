@@ -52,9 +52,9 @@ def test_a_wave_without_noise_is_found_exactly():
     assert wave.speed.value == pytest.approx(OMEGA / 0.7, rel=1e-9)
     assert wave.direction == "first-to-last"
     assert wave.deviation_rad == pytest.approx(0.0, abs=1e-9)
-    assert [one.amplitude_rad.value for one in motion.joints] == pytest.approx([0.4] * 8)
-    assert [one.offset_rad.value for one in motion.joints] == pytest.approx(0.1 * np.arange(8))
-    assert [one.lag_rad.value for one in motion.joints[1:]] == pytest.approx([0.7] * 7)
+    assert [joint.amplitude_rad.value for joint in motion.joints] == pytest.approx([0.4] * 8)
+    assert [joint.offset_rad.value for joint in motion.joints] == pytest.approx(0.1 * np.arange(8))
+    assert [joint.lag_rad.value for joint in motion.joints[1:]] == pytest.approx([0.7] * 7)
     assert motion.joints[0].lag_rad.value is None
 
 
@@ -70,7 +70,7 @@ def test_a_robot_gives_planes_and_metres():
     assert second.wave_number.value == pytest.approx(0.5)
     assert first.direction == "last-to-first"
     assert first.speed_m_s.value == pytest.approx(OMEGA / 0.4 * length)
-    assert {one.plane for one in motion.waves} == {one.plane for one in motion.joints}
+    assert {wave.plane for wave in motion.waves} == {joint.plane for joint in motion.joints}
 
 
 @pytest.mark.nightly
@@ -153,7 +153,7 @@ def test_the_place_of_a_joint_that_is_left_out_counts():
     motion = fit_motion(series, measured(series)[0]).oscillation
     index = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
     numbers = local_wave_numbers(motion, index, phases)
-    assert [one.value for one in numbers] == pytest.approx([0.3, 0.5, 0.6, 0.7])
+    assert [number.value for number in numbers] == pytest.approx([0.3, 0.5, 0.6, 0.7])
 
 
 def test_a_joint_at_rest_has_no_phase_and_the_wave_goes_on_behind_it():

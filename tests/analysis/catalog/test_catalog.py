@@ -73,7 +73,7 @@ def test_facts_are_those_of_the_mcap_package_within_few_requests(tmp_path):
     counted = summary.statistics
     assert (facts.start_ns, facts.messages) == (counted.message_start_time, counted.message_count)
     assert facts.end_ns == counted.message_end_time
-    assert facts.topics == tuple(sorted({one.topic for one in summary.channels.values()}))
+    assert facts.topics == tuple(sorted({channel.topic for channel in summary.channels.values()}))
     assert facts.metadata == {name: metadata[name] for name in facts.metadata}
     assert {"undulog", "undulog.health"} <= facts.metadata.keys()
     assert len(requests) <= MOST_REQUESTS
@@ -120,9 +120,9 @@ def test_a_row_a_session_with_the_results_beside_it(lab, analysed):
     assert gait.lag_sd == result.heterogeneity["lag_sd"].value
     assert (gait.lag_sd_low, gait.lag_sd_high) == result.heterogeneity["lag_sd"].ci95
     joints = catalog.find(joints=True)
-    assert joints.joint.to_list() == [one.name for one in result.joints]
-    assert joints.gain.to_list() == [one.gain.value for one in result.joints]
-    assert joints.lag_rad_high.to_list() == [one.lag_rad.ci95[1] for one in result.joints]
+    assert joints.joint.to_list() == [joint.name for joint in result.joints]
+    assert joints.gain.to_list() == [joint.gain.value for joint in result.joints]
+    assert joints.lag_rad_high.to_list() == [joint.lag_rad.ci95[1] for joint in result.joints]
     assert set(joints.path) == {"day1/gait.mcap"}
     assert len(catalog.find(f"lag_sd > {gait.lag_sd / 2} and duration_s > 5")) == 1
     assert len(catalog.find("operator = 'Ada' and status = 'not analysed'")) == 1
@@ -235,7 +235,9 @@ def test_parts_of_a_session_are_one_row(tmp_path):
     rows = catalog.find().set_index("path")
     assert rows.parts.to_dict() == {"other.mcap": 1, "run.mcap": 3}
     with Session.open(tmp_path / "run.mcap") as session:
-        assert rows.messages["run.mcap"] == sum(one.count for one in session.channels.values())
+        assert rows.messages["run.mcap"] == sum(
+            channel.count for channel in session.channels.values()
+        )
         assert rows.duration_s["run.mcap"] == session.duration_s
         assert rows.start_ns["run.mcap"] == session.start_ns
 

@@ -143,7 +143,7 @@ def test_an_offset_that_moved_is_named_with_its_date(without_models, few_simulat
 def test_variance_components_are_those_planted():
     sessions, rows, _, _ = frames(8)
     (robot,) = analyse_fleet(sessions, rows).robots
-    by_name = {one.quantity: one for one in robot.components}
+    by_name = {component.quantity: component for component in robot.components}
     assert by_name["lag"].residual == pytest.approx(0.01, rel=0.1)
     assert by_name["lag"].session == pytest.approx(0.02, rel=0.3)
     assert by_name["energy"].joint == pytest.approx(0.2, rel=0.6)
@@ -154,7 +154,7 @@ def test_a_trend_is_that_planted(without_models, without_changes):
     sessions, rows, _, _ = frames(8)
     days = (sessions.start - FIRST) / pd.Timedelta(days=1)
     drifting = sessions.assign(lag_sd=0.01 + 0.001 * days)
-    trends = {one.quantity: one for one in analyse_fleet(drifting, rows).robots[0].trends}
+    trends = {trend.quantity: trend for trend in analyse_fleet(drifting, rows).robots[0].trends}
     assert trends["lag_sd"].tau == 1.0
     assert trends["lag_sd"].p < 1e-6
     low, high = trends["lag_sd"].slope_ci95

@@ -35,9 +35,9 @@ def motion(amplitudes, seed, noise=NOISE, robot=None):
     t = np.arange(-SECONDS / 2, SECONDS / 2, 1 / RATE)
     series = {}
     names = NAMES if robot is None else robot.joint_names
-    for name, one in zip(names, amplitudes, strict=True):
+    for name, amplitude in zip(names, amplitudes, strict=True):
         at = t + rng.uniform(0, 0.3 / RATE, t.size)
-        angles = np.real(one * np.exp(1j * OMEGA * at)) + 0.1
+        angles = np.real(amplitude * np.exp(1j * OMEGA * at)) + 0.1
         series[name] = Series(name, at, angles + noise * rng.standard_normal(t.size))
     gait = fit_gait({}, series, SECONDS, lambda _: None)
     return motion_of(f"{seed}.mcap", robot, fit_motion(series, gait))

@@ -51,7 +51,9 @@ def compared(a, b, **choices):
 
 
 def by_key(comparison):
-    return {(one.quantity, one.place): one for one in comparison.differences}
+    return {
+        (difference.quantity, difference.place): difference for difference in comparison.differences
+    }
 
 
 @pytest.mark.slow
@@ -77,13 +79,13 @@ def test_mean_cycles_differ_as_in_closed_form(write, wave):
     before, after = (wave(np.random.default_rng(11), joints=5) for _ in range(2))
     weaken(after)
     phase = np.array(result.phase_rad)
-    for k, one in enumerate(result.waveforms):
+    for k, waveform in enumerate(result.waveforms):
         # Phase 0 is the crest of joint01's command, a sine.
         turn = phase + np.pi / 2 + before.phase[k] - before.phase[0]
         a, b = (w.gain[k] * w.amplitude[k] * np.sin(turn - w.lag[k]) for w in (before, after))
-        off = np.abs(np.array(one.difference_rad) - (b - a))
-        assert np.mean(off <= np.array(one.half_rad)) > 0.9
-        np.testing.assert_allclose(one.a_rad, a + 0.04, atol=5 * SIGMA / np.sqrt(7))
+        off = np.abs(np.array(waveform.difference_rad) - (b - a))
+        assert np.mean(off <= np.array(waveform.half_rad)) > 0.9
+        np.testing.assert_allclose(waveform.a_rad, a + 0.04, atol=5 * SIGMA / np.sqrt(7))
     assert max(result.waveforms, key=lambda one: one.rms_rad).name == "joint03"
 
 
@@ -99,7 +101,9 @@ def test_a_session_is_the_same_as_itself(write):
     path = write("a", 7)
     result = compared(path, path)
     assert result.verdict == "same"
-    assert all(one.difference.value == 0 and one.p == 1 for one in result.differences)
+    assert all(
+        difference.difference.value == 0 and difference.p == 1 for difference in result.differences
+    )
     assert any("the same content" in warning for warning in result.warnings)
 
 
@@ -107,7 +111,11 @@ def test_a_session_is_the_same_as_itself(write):
 def test_with_much_noise_the_question_stays_open(write):
     result = compared(write("a", 8), write("b", 9), session=Options(start_s=0.0, stop_s=3.3))
     assert result.verdict in ("same", "open")
-    wide = max(one.difference.ci95[1] for one in result.differences if one.quantity == "gain")
+    wide = max(
+        difference.difference.ci95[1]
+        for difference in result.differences
+        if difference.quantity == "gain"
+    )
     if result.verdict == "open":
         assert "could hide in the noise" in result.answer
         assert wide > 0.0
@@ -118,8 +126,10 @@ def test_energy_alone_may_differ(write):
     result = compared(write("a", 10), write("b", 11, energy=1.2))
     assert result.verdict == "small"
     assert "are equivalent within 2 % and 1°; beyond doubt" in result.answer
-    energies = [one for one in result.differences if one.quantity == "energy_abs"]
-    ratios = [one.difference.value / one.a for one in energies]
+    energies = [
+        difference for difference in result.differences if difference.quantity == "energy_abs"
+    ]
+    ratios = [energy.difference.value / energy.a for energy in energies]
     # E_abs of noisy torque is not quite proportional to it.
     assert ratios == pytest.approx([0.2] * 5, abs=0.01)
 
@@ -167,9 +177,11 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, com
     every = re.search(r'<table class="quantities">.*?</table>', html, re.DOTALL)[0]
     assert every.count("<tr") == 1 + len(result.differences)
     shown = {float(v) for v in re.findall(r'<data value="([^"]+)"', every)}
-    for one in result.differences:
-        factor = {"gain": 100.0, "lag": np.degrees(1.0)}.get(one.quantity, 100.0 / one.a)
-        for value in (one.difference.value, *one.difference.ci95):
+    for difference in result.differences:
+        factor = {"gain": 100.0, "lag": np.degrees(1.0)}.get(
+            difference.quantity, 100.0 / difference.a
+        )
+        for value in (difference.difference.value, *difference.difference.ci95):
             assert any(np.isclose(value * factor, other) for other in shown)
     assert "://" not in html.replace(str(tmp_path), "")
     assert "Mean cycles by gait phase" in html

@@ -63,6 +63,10 @@ def test_other_noise_makes_no_difference(twins):
 def test_speed_is_that_of_the_centre_of_mass_in_the_physics(twins):
     """All links weigh the same; over the last four whole cycles, samples 100 a second."""
     (base, again, _), path = twins
-    speed = next(one for one in compared(base, again).differences if one.quantity == "speed")
+    speed = next(
+        difference
+        for difference in compared(base, again).differences
+        if difference.quantity == "speed"
+    )
     truth = float(np.linalg.norm((path[-1] - path[-401])[:2])) / 4.0
     assert speed.a == pytest.approx(truth, rel=0.005)

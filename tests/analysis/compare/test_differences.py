@@ -111,7 +111,7 @@ def test_what_differs_is_ranked_by_size_in_margins_and_named():
     a = Quantities(np.zeros(8), np.full(8, 1e-8), np.full(8, 30.0))
     b = Quantities(np.array([0, 0, -0.06, 0.001, 0, 0, -0.1, 0]), a.variance, a.dof)
     decided = decide(names, a, b, independent(a, b), Margins())
-    largest = [(one.quantity, one.place) for one in decided.differences[:3]]
+    largest = [(difference.quantity, difference.place) for difference in decided.differences[:3]]
     assert largest == [("lag", "joint2"), ("gain", "joint2"), ("gain", "joint3")]
     assert [one.name for one in decided.named] == ["joint2", "joint3"]
     gain = decided.differences[1]

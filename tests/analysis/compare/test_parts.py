@@ -72,18 +72,18 @@ def test_cycles_by_phase_keep_every_harmonic():
     def motion(phase):
         return 0.4 * np.cos(phase - 0.3) + 0.05 * np.cos(5 * phase) + 0.1
 
-    one = Series("a", t, motion(omega * t + 1.1))
-    fit = fit_at([one], omega, HarmonicModel(harmonics=1))
-    cut = cycles_by_phase(one, fit, 0, zero_rad=1.1, start_s=0.0, stop_s=10.0)
+    series = Series("a", t, motion(omega * t + 1.1))
+    fit = fit_at([series], omega, HarmonicModel(harmonics=1))
+    cut = cycles_by_phase(series, fit, 0, zero_rad=1.1, start_s=0.0, stop_s=10.0)
     assert cut.shape == (7, 72)
     np.testing.assert_allclose(cut, np.tile(motion(phases_rad()), (7, 1)), atol=2e-4)
 
 
 def test_a_cycle_with_a_gap_is_left_out():
     t = np.concatenate([np.arange(0, 3.2, 0.01), np.arange(3.7, 6.0, 0.01)])
-    one = Series("a", t, np.cos(2 * np.pi * t))
-    fit = fit_at([one], 2 * np.pi, HarmonicModel(harmonics=1))
-    assert len(cycles_by_phase(one, fit, 0, zero_rad=0.0, start_s=0.0, stop_s=6.0)) == 5
+    series = Series("a", t, np.cos(2 * np.pi * t))
+    fit = fit_at([series], 2 * np.pi, HarmonicModel(harmonics=1))
+    assert len(cycles_by_phase(series, fit, 0, zero_rad=0.0, start_s=0.0, stop_s=6.0)) == 5
 
 
 def test_a_cycle_by_another_joints_phase():

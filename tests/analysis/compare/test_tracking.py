@@ -64,7 +64,10 @@ def compared(a, b):
 
 
 def by_key(comparison):
-    return {(one.quantity, one.place): one.difference for one in comparison.differences}
+    return {
+        (difference.quantity, difference.place): difference.difference
+        for difference in comparison.differences
+    }
 
 
 def test_an_offset_that_moved_and_a_gain_that_fell_are_stated_with_their_intervals(tmp_path):
@@ -150,10 +153,10 @@ def test_of_sessions_in_which_nothing_differs_one_in_twenty_states_a_difference(
     rng, false = np.random.default_rng(5), 0
     for _ in range(40):
         joints = [tracked(work(rng), rng) for _ in range(2)]
-        estimates = [tracking_estimates(own) for own in joints]
-        sides = at_one_command(estimates, [mean_commands({}, own) for own in joints])
+        estimates = [tracking_estimates(joint) for joint in joints]
+        sides = at_one_command(estimates, [mean_commands({}, joint) for joint in joints])
         keys = list(sides[0])
-        first, second = (Quantities(*np.array([own[k] for k in keys]).T) for own in sides)
+        first, second = (Quantities(*np.array([side[k] for k in keys]).T) for side in sides)
         false += float(holm(independent(first, second).p).min()) < 0.05
     assert false <= 6
 

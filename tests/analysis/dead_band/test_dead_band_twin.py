@@ -32,7 +32,7 @@ def two_joints(width, stall_torque):
         static_friction=friction,
         coulomb_friction=friction,
     )
-    joints = tuple(dataclasses.replace(one, servo=servo) for one in robot.joints[:2])
+    joints = tuple(dataclasses.replace(joint, servo=servo) for joint in robot.joints[:2])
     scenario = Scenario(
         name="rest",
         description="two joints with stick",
@@ -45,9 +45,9 @@ def two_joints(width, stall_torque):
     )
     with Twin(scenario, kernels=Kernels.NUMBA) as twin:
         rows = [
-            (one.time_s, one.gait.command.copy(), one.step.body.angle.copy())
-            for one in twin.samples()
-            if one.time_s >= 2.0
+            (sample.time_s, sample.gait.command.copy(), sample.step.body.angle.copy())
+            for sample in twin.samples()
+            if sample.time_s >= 2.0
         ]
     t_s = np.array([row[0] for row in rows])
     commands, angles = (np.array([row[k] for row in rows]) for k in (1, 2))

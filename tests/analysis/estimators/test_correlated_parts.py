@@ -43,7 +43,7 @@ def test_gains_and_lags_have_each_their_correlation_share_and_residuals(correlat
     power = np.sum(found.residuals[part] ** 2, axis=1)
     np.testing.assert_allclose(power, COUNT * series[part].var(axis=1))
     # Of those that wander one noise of the grid explains both.
-    grid = [one for one in _noises(PLACE, np.ones(COUNT)) if one.correlation == shared]
+    grid = [noise for noise in _noises(PLACE, np.ones(COUNT)) if noise.correlation == shared]
     ones = [one.whiten.sum(axis=1) for one in grid]
     shares = [1 / (column @ column) for column in ones]
     near = int(np.argmin(np.abs(np.array(shares) - found.share[1 - index])))

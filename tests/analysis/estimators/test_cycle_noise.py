@@ -63,8 +63,8 @@ def test_ratios_and_noise_of_runs_of_any_length_are_those_of_a_loop():
         np.testing.assert_allclose(found.ratio, ratio, rtol=1e-9)
         np.testing.assert_allclose(found.variance, variance, rtol=1e-9)
         assert found.dof == pytest.approx(dof)
-        np.testing.assert_array_equal(found.start_s, np.concatenate([one[:-1] for one in edges]))
-        np.testing.assert_array_equal(found.stop_s, np.concatenate([one[1:] for one in edges]))
+        np.testing.assert_array_equal(found.start_s, np.concatenate([edge[:-1] for edge in edges]))
+        np.testing.assert_array_equal(found.stop_s, np.concatenate([edge[1:] for edge in edges]))
         seen.add(dof > 0)
     assert seen == {True, False}
 

@@ -153,10 +153,10 @@ def test_a_phase_may_be_logged_within_a_turn(tmp_path):
     running = over_time(tmp_path / "running.mcap", phi)
     turning = over_time(tmp_path / "turning.mcap", phi % (2 * np.pi))
     assert len(running.joints[0].gain) == int((phi[-1] - 2 * np.pi) / (2 * np.pi))
-    for one, other in zip(running.joints, turning.joints, strict=True):
-        assert one.start_s == pytest.approx(other.start_s, abs=1e-9)
-        assert one.gain == pytest.approx(other.gain, rel=1e-9)
-        assert one.lag_rad == pytest.approx(other.lag_rad, abs=1e-9)
+    for joint, other in zip(running.joints, turning.joints, strict=True):
+        assert joint.start_s == pytest.approx(other.start_s, abs=1e-9)
+        assert joint.gain == pytest.approx(other.gain, rel=1e-9)
+        assert joint.lag_rad == pytest.approx(other.lag_rad, abs=1e-9)
 
 
 # -- the noise of a cycle, by second differences --------------------------------------------------
@@ -176,7 +176,7 @@ def test_second_differences_have_the_degrees_of_freedom_of_their_covariance(coun
 def test_the_noise_of_a_cycle_is_that_of_its_second_differences():
     rng = np.random.default_rng(8)
     edges = [np.arange(42.0), np.arange(100.0, 131.0)]
-    asked = [0.5 + 0.1 * np.cos(np.arange(one.size - 1)) + 0j for one in edges]
+    asked = [0.5 + 0.1 * np.cos(np.arange(edge.size - 1)) + 0j for edge in edges]
     truth = [0.8 * np.exp(-0.3j + 0.01j * np.arange(one.size)) for one in asked]
     sigma = 0.002
     given = [

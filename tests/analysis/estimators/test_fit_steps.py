@@ -45,11 +45,11 @@ def test_a_step_goes_a_quarter_of_a_bin_at_most(monkeypatch, sign):
 def test_after_the_last_step_the_fit_is_that_of_its_frequency(monkeypatch):
     monkeypatch.setattr(harmonic, "MAX_STEPS", 2)
     series = [tone()]
-    found = fit_shared(series, OMEGA + 0.1, MODEL)
-    exact = fit_at(series, found.omega, MODEL)
-    assert isinstance(found, HarmonicFit)
-    np.testing.assert_array_equal(found.amplitudes, exact.amplitudes)
-    np.testing.assert_array_equal(found.rss, exact.rss)
+    shared = fit_shared(series, OMEGA + 0.1, MODEL)
+    exact = fit_at(series, shared.omega, MODEL)
+    assert isinstance(shared, HarmonicFit)
+    np.testing.assert_array_equal(shared.amplitudes, exact.amplitudes)
+    np.testing.assert_array_equal(shared.rss, exact.rss)
 
 
 def test_three_harmonics_and_a_constant_are_fitted_where_nothing_is_said():

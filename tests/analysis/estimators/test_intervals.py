@@ -159,7 +159,7 @@ def test_errors_of_a_logarithm_are_relative_errors():
 def _bins(values, spread, rounding):
     """Fields of :class:`ResidualBins`; those that these errors don't need stay empty."""
     given = {"values": values, "spread": spread, "rounding": rounding, "steps": 2 * rounding}
-    names = [one.name for one in dataclasses.fields(ResidualBins)]
+    names = [field.name for field in dataclasses.fields(ResidualBins)]
     return {name: given.get(name, np.zeros(3)) for name in names}
 
 

@@ -120,7 +120,7 @@ def test_contrasts_of_rounded_joints():
     phase = np.repeat(random.uniform(-3, 3, runs), joints) - np.tile(np.arange(joints), runs)
     truth = size * np.exp(1j * phase)
     waves = (truth[:, None] * np.exp(1j * np.pi * t)).real
-    series = [Series("q", t, STEP * np.rint(one / STEP)) for one in waves]
+    series = [Series("q", t, STEP * np.rint(wave / STEP)) for wave in waves]
     fit = fit_at(series, np.pi)
     _, bins = residual_spectrum(series, fit)
     exact = ResidualBins(0 * bins.values, bins.offset, bins.spread, 0 * bins.rounding)

@@ -155,7 +155,7 @@ def test_the_grid_of_scatter_is_an_autoregression_and_white_noise():
     np.testing.assert_allclose(white.whiten, np.diag(1 / relative))
     assert (white.correlation, white.prior) == (0.0, 0.5)
     assert len(others) == 35
-    assert sum(one.prior for one in others) == pytest.approx(0.5)
+    assert sum(other.prior for other in others) == pytest.approx(0.5)
     mixed = others[2]  # 0.3, a quarter white
     matrix = 0.75 * 0.3 ** np.abs(place[:, None] - place) + 0.25 * np.diag(relative**2)
     inverse = np.linalg.inv(matrix)

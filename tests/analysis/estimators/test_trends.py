@@ -29,7 +29,9 @@ def test_drifts_are_polynomials_of_zero_mean(place):
 
 def test_the_fewest_cycles_have_the_fewest_trends():
     def kinds(count):
-        return [(one.kind, one.designs.shape[2]) for one in families(np.arange(float(count)))]
+        return [
+            (family.kind, family.designs.shape[2]) for family in families(np.arange(float(count)))
+        ]
 
     assert kinds(5) == [("drifting", 2), ("settling", 2)]
     assert kinds(6) == [("drifting", 2), ("drifting", 3), ("settling", 2), ("ringing", 3)]

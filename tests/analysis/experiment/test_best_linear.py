@@ -90,7 +90,7 @@ def test_distortion_is_that_of_a_thousand_noise_free_realisations(square, cube):
     # |e|^2 / total has the distribution F(2, 18), of the mean 18 / 16.
     assert np.mean(errors) == pytest.approx(18 / 16, abs=0.15)
     for values, true in ((found, relative), (odd, truth[1]), (even, truth[0])):
-        got = np.array([one.value for one in values])
+        got = np.array([value.value for value in values])
         if true > 0.01:  # a typical set of ten realisations, not only their mean
             assert np.sqrt(np.mean(got**2)) == pytest.approx(true, rel=0.1)
             assert np.median(np.abs(got / true - 1)) < 0.1

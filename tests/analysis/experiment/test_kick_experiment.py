@@ -154,8 +154,8 @@ def test_phase_kicks_alone_give_p_and_r(sessions):
     coupling = result.coupling
     assert coupling.identifiable
     assert (coupling.G, coupling.S, coupling.nonlinearity.value) == (None, None, None)
-    assert any("G, S and the nonlinearity are null" in one for one in result.warnings)
-    assert any("record held-out runs" in one for one in result.warnings)
+    assert any("G, S and the nonlinearity are null" in warning for warning in result.warnings)
+    assert any("record held-out runs" in warning for warning in result.warnings)
     assert json.dumps(result.to_dict(), allow_nan=False)
 
 

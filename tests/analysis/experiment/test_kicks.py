@@ -59,12 +59,12 @@ def kicked(command, kick):
 
 def run_all(system, command, kicks, turns=None):
     """Changes of the responses of every kick; each run started at its own time."""
-    commands = np.stack([kicked(command, one) for one in kicks])
+    commands = np.stack([kicked(command, kick) for kick in kicks])
     deviation = np.log(commands / command)
     if turns is not None:
         commands = commands * np.exp(1j * turns)[:, None]
         deviation = np.stack([deviation_of(one, command) for one in commands])
-    ratio = np.stack([system(one) / one for one in commands])
+    ratio = np.stack([system(command) / command for command in commands])
     return deviation + np.log(ratio / (system(command) / command))
 
 
@@ -244,7 +244,7 @@ def test_kicks_are_estimated_from_phasors():
     rng = np.random.default_rng(1)
     kicks = plan()
     pattern = command * np.exp(0.15j * np.array([1, -1, 0.5, 0.2, -0.7]))
-    runs = [command, command, *(kicked(command, one) for one in kicks), pattern]
+    runs = [command, command, *(kicked(command, kick) for kick in kicks), pattern]
     order = rng.permutation(len(runs))
     found = sort_kicks(np.stack([runs[k] * np.exp(1j * rng.uniform(-np.pi, np.pi)) for k in order]))
     assert {int(order[k]) for k in found.base} == {0, 1}

@@ -147,7 +147,7 @@ def test_a_weak_module_is_found_and_named(size):
         test = mirror_test(*both_ways(rng, pattern(13), module, scatter=scatter))
         pairs = ordered_pairs(names, test)
         found += test.p < 0.05
-        first = [(one.name, one.mirror, one.by) for one in pairs[:1]]
+        first = [(pair.name, pair.mirror, pair.by) for pair in pairs[:1]]
         right += first == [("joint10", "joint04", "lag")]
     missed = nct.cdf(t_distribution.isf(0.05 / 26 / 2, 10), 10, 2**0.5 * size)
     assert found / sets == pytest.approx(1 - missed, abs=0.09)  # standard error up to 3.5 %
@@ -162,7 +162,7 @@ def test_a_strong_module_orders_its_pair():
     rng = np.random.default_rng(2)
     module = np.array([0.1, 0, 0, 0, 0])
     pairs = ordered_pairs("abcde", mirror_test(*both_ways(rng, pattern(5), module, scatter=0.003)))
-    assert [(one.name, one.mirror, one.by) for one in pairs] == [("e", "a", "gain")]
+    assert [(pair.name, pair.mirror, pair.by) for pair in pairs] == [("e", "a", "gain")]
     low, high = pairs[0].log_gain_contrast.ci95
     assert low < -0.1 < high
 

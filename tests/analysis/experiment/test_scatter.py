@@ -118,7 +118,7 @@ def test_sums_that_fail_widen_and_come_first():
     assert not coupling.checks_pass
     answer = kick_answer(coupling)
     assert answer.startswith("coupling around this gait: doubtful, since rows of P don't sum to 1")
-    assert any("let each run settle longer" in one for one in warnings)
+    assert any("let each run settle longer" in warning for warning in warnings)
     assert coupling.scatter.widened > 3.0
     # Every element is off by 0.06, and its interval has the truth in spite of it.
     L = H * C[None, :] / (H @ C)[:, None]

@@ -129,8 +129,8 @@ def test_both_routes_find_the_same_impedance():
     servos = [dataclasses.replace(LINEAR, stall_torque=torque) for torque in (0.3, 0.7, 1.5, 1.5)]
     Z, C = 0.05 * random_matrix(rng, m), dft(m, 0.02)
     # Each run solved joint by joint: body torque = servo torque.
-    command = np.array([servo_torque(one, omega, 1.0, 0.0) for one in servos])
-    angle = np.array([servo_torque(one, omega, 0.0, 1.0) for one in servos])
+    command = np.array([servo_torque(servo, omega, 1.0, 0.0) for servo in servos])
+    angle = np.array([servo_torque(servo, omega, 0.0, 1.0) for servo in servos])
     Y = np.linalg.solve(Z - np.diag(angle), command[:, None] * C)
     known = np.full(Y.shape, 1e-16), np.full(Y.shape, 24.0)
     sharp, torque = Phasors(Y, *known), Phasors(Z @ Y, *known)
@@ -172,9 +172,9 @@ def sessions(columns, omega=np.pi, names="abcde"):
 def test_a_sweep_is_recognised_by_its_commands():
     waves = dft(5, 0.02)
     turned = waves * np.exp(1j * np.arange(5))[:, None]  # each started at another time
-    found = find_sweep([None, *sessions(turned), None])
-    assert found.index == (1, 2, 3, 4, 5)
-    assert (found.lines, found.tones, found.lacking) == (1, (0,), 0)
+    sweep = find_sweep([None, *sessions(turned), None])
+    assert sweep.index == (1, 2, 3, 4, 5)
+    assert (sweep.lines, sweep.tones, sweep.lacking) == (1, (0,), 0)
     assert find_sweep(sessions(turned[:4])).lacking == 1
     # The gait that it was planned around is no run of it, nor is one of another frequency.
     others = [*sessions([0.3 * np.exp(1j * np.arange(5))]), *sessions(waves[:1], 3.2)]

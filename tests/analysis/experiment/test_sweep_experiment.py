@@ -138,7 +138,9 @@ def test_h_and_z_are_those_planted(result):
 def test_contact_that_is_not_known_is_reported(result):
     assert result.coupling.contact is None
     assert "which its sessions don't record" in result.coupling.validity
-    assert [one for one in result.warnings if "whether the robot touched anything" in one]
+    assert [
+        warning for warning in result.warnings if "whether the robot touched anything" in warning
+    ]
     assert len(result.warnings) == 1
 
 
@@ -205,7 +207,7 @@ def test_responses_that_drift_are_reported(tmp_path):
     result = experiment(sweep(tmp_path, robot=ROBOT, scenario=FREE, drift=2e-3))
     # 0.2 % a second is 0.4 % a cycle.
     assert result.coupling.drift_per_cycle == pytest.approx(4e-3, rel=0.1)
-    assert any("not settled" in one for one in result.warnings)
+    assert any("not settled" in warning for warning in result.warnings)
     assert result.coupling.contact is False
 
 
@@ -216,7 +218,7 @@ def test_a_multisine_shows_every_tone(tmp_path):
     result = experiment(sweep(tmp_path, omegas=omegas, robot=ROBOT, scenario=scenario))
     coupling = result.coupling
     assert coupling.plan == "multisine"
-    assert [one.frequency_hz for one in coupling.tones] == pytest.approx([0.5, 1.1, 1.7])
+    assert [tone.frequency_hz for tone in coupling.tones] == pytest.approx([0.5, 1.1, 1.7])
     for tone, omega in zip(coupling.tones, omegas, strict=True):
         assert tone.command_condition == pytest.approx(1.0, abs=1e-6)
         close(tone.H, true_h(omega))
@@ -237,7 +239,7 @@ def test_a_multisine_in_contact_reports_what_is_mixed(tmp_path, opened):
     coupling = result.coupling
     assert (coupling.identifiable, coupling.contact) == (True, True)
     assert coupling.validity.startswith("in contact")
-    assert any(one.startswith("not linear") for one in result.warnings)
+    assert any(warning.startswith("not linear") for warning in result.warnings)
     # A record holds two periods of the grid: line k of 0.1 Hz is bin 2 k of its transform.
     lines = np.arange(1, 28)  # to the highest tone and twice the gait's beyond it
     found = np.isin(lines, [5, 11, 17])

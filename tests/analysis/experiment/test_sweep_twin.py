@@ -59,10 +59,10 @@ def measured(folder, plan, *words, kernels=Kernels.NUMBA):
     driven = []
     for seed, file in enumerate(sorted(runs.glob("*.mcap"))):
         world = load_scenario(folder / "free.toml").changed(seed=seed + 1)
-        one = find_motion(str(file), world)
+        motion = find_motion(str(file), world)
         driven.append(runs / f"driven{seed:02d}.mcap")
-        scenario = one.scenario(world, None)
-        driver = Driver(one.make(scenario.robot, scenario), one.facts, one.attachments)
+        scenario = motion.scenario(world, None)
+        driver = Driver(motion.make(scenario.robot, scenario), motion.facts, motion.attachments)
         record(scenario, driven[-1], driver=driver, kernels=kernels)
     with Session.open(file) as session:
         settle = session.metadata["undulog.plan"]["settle_s"]

@@ -205,4 +205,4 @@ def test_pairs_are_ordered_by_their_contrast_not_by_one_direction():
     forward, reverse = runs(rng, module=module)
     forward[:, [1, 5]] += 0.05
     pairs = reversal.ordered_pairs(NAMES, mirror_test(forward, reverse))
-    assert [(one.name, one.mirror) for one in pairs] == [("b", "f")]
+    assert [(pair.name, pair.mirror) for pair in pairs] == [("b", "f")]

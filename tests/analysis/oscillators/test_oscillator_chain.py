@@ -59,7 +59,7 @@ class Planted:
 
 def walk(chains, rng, duration_s, noise, kick, *, every_s=5.0, steps=5):
     """Phases of chains by Euler and Maruyama, every phase kicked by up to `kick` every so often."""
-    K, psi, omega = (np.stack([getattr(one, name) for one in chains]) for name in PARTS)
+    K, psi, omega = (np.stack([getattr(chain, name) for chain in chains]) for name in PARTS)
     h, state, found = PERIOD_S / steps, np.zeros(omega.shape), []
     for k in range(round(duration_s / h)):
         if kick and k and k % round(every_s / h) == 0:

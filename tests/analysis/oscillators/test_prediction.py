@@ -49,8 +49,8 @@ def test_a_path_relaxes_at_its_closed_form(m):
     found = closed_loop(exact(np.eye(m) - K * path_laplacian(m), np.zeros((m, m))), EPS)
     rates = 4 * EPS * K * np.sin(np.arange(1, m) * math.pi / (2 * m)) ** 2
     np.testing.assert_allclose([one.rate.value for one in found.modes], rates, atol=1e-9)
-    for one, rate in zip(found.modes, rates, strict=True):
-        assert one.rate.ci95 == pytest.approx((rate, rate))
+    for mode, rate in zip(found.modes, rates, strict=True):
+        assert mode.rate.ci95 == pytest.approx((rate, rate))
     slowest = np.cos((np.arange(m) + 0.5) * math.pi / m)
     pattern = np.array(found.modes[0].pattern_abs)
     np.testing.assert_allclose(pattern, np.abs(slowest) / np.linalg.norm(slowest), atol=1e-9)
@@ -105,7 +105,7 @@ def test_intervals_of_rates_hold_under_scatter(draws):
     random = np.random.default_rng(3)
     inside = []
     for _ in range(draws):
-        ends = [one.rate.ci95 for one in closed_loop(measured(random, 0.1)[2], EPS).modes]
+        ends = [mode.rate.ci95 for mode in closed_loop(measured(random, 0.1)[2], EPS).modes]
         # Of the sums: rates that lie close together change places.
         inside += [low <= t <= high for (low, high), t in zip(ends, truth, strict=True)]
     assert np.mean(inside) >= 0.91

@@ -94,7 +94,7 @@ def test_a_joint_at_its_limit_is_named_and_the_others_make_up_for_it():
     base = BaseGait(names, tuple(yaw), WANTED, np.zeros(25), WAVE.omega)
     local = replace(EXACT, joints=tuple(names[k] for k in yaw))
     free, _ = compensation(local, base, None, keep=0.0)
-    needs = np.array([one.amplitude_rad for one in free.joints])
+    needs = np.array([joint.amplitude_rad for joint in free.joints])
     worst = int(np.argmax(needs))
     limit = float((needs[worst] + np.sort(needs)[-2]) / 2)
     joints = list(robot.joints)
@@ -204,5 +204,5 @@ def commanded(file):
         columns = [signals.signal(name) for name in linear_chain.NAMES]
         t = (columns[0].t_ns - session.start_ns) * 1e-9
     used = (t >= 10.0 - 1e-9) & (t < 20.0 - 1e-9)
-    values = np.stack([one.values for one in columns])[:, used]
+    values = np.stack([column.values for column in columns])[:, used]
     return 2 / used.sum() * values @ np.exp(-2j * np.pi * t[used])

@@ -35,7 +35,7 @@ def phasors(path, start_s, seconds=5.0, frequency_hz=0.8):
         plan = dict(session.metadata["undulog.plan"])
         t = (columns[0].t_ns - session.start_ns) * 1e-9
     inside = (t >= start_s - 1e-9) & (t < start_s + seconds - 1e-9)
-    values = np.stack([one.values for one in columns])[:, inside]
+    values = np.stack([column.values for column in columns])[:, inside]
     turn = np.exp(-2j * np.pi * np.atleast_1d(frequency_hz)[:, None] * t[inside])
     return 2 * turn @ values.T / turn.shape[1], values.mean(axis=1), plan
 
@@ -85,10 +85,12 @@ def test_a_reversal_alternates(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
     files = report_of("plan", "reversal", *words)["files"]
     assert len(files) == 4
-    step = np.angle([one[1] / one[0] for one in [phasors(file, 2.0)[0][0, YAW] for file in files]])
+    step = np.angle(
+        [phasor[1] / phasor[0] for phasor in [phasors(file, 2.0)[0][0, YAW] for file in files]]
+    )
     np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
     plans = [phasors(file, 2.0)[2] for file in files]
-    assert [float(one["heading_rad"]) for one in plans] == pytest.approx([0, np.pi, np.pi, 0])
+    assert [float(plan["heading_rad"]) for plan in plans] == pytest.approx([0, np.pi, np.pi, 0])
     assert [file.rpartition("-")[2] for file in files] == [f"{h}.mcap" for h in (0, 180, 180, 0)]
 
 

@@ -64,7 +64,7 @@ def test_only_the_excited_lines_are_commanded(inputs, like, tmp_path, report_of)
         assert np.abs(first[:, places] - offset[places]).max() <= float(record["peak_rad"]) + 1e-4
         matrices.setdefault(record["realisation"], []).append(spectrum[lines])
     assert len(matrices) == 2
-    one, other = (np.stack(each) for each in matrices.values())
+    one, other = (np.stack(matrix) for matrix in matrices.values())
     assert np.abs(one - other).max() > 0.01  # other phases
     if inputs == "orthogonal":
         for each in (one, other):

@@ -76,8 +76,8 @@ def test_a_spreadsheet_runs_nothing(tmp_path):
     snake = built_results.make_snake()
     names = ["=cmd()", "+1", "@x", "plain", 'a"b\r\n,c']
     joints = [
-        dataclasses.replace(one, name=name, flags=("-2+3",))
-        for one, name in zip(snake.joints, names, strict=False)
+        dataclasses.replace(joint, name=name, flags=("-2+3",))
+        for joint, name in zip(snake.joints, names, strict=False)
     ]
     result = dataclasses.replace(snake, joints=tuple(joints))
     write_csv([result], tmp_path / "x.csv")
@@ -91,8 +91,10 @@ def test_groups_have_windows_of_their_own(tmp_path):
     snake = built_results.make_snake()
     gait = snake.gait
     windows = (Window(1.0, 3.0, 2.0), Window(4.0, 5.0, 1.0))
-    groups = tuple(dataclasses.replace(one, windows=windows) for one in gait.groups)
-    joints = tuple(dataclasses.replace(one, group=0 if groups else None) for one in snake.joints)
+    groups = tuple(dataclasses.replace(group, windows=windows) for group in gait.groups)
+    joints = tuple(
+        dataclasses.replace(joint, group=0 if groups else None) for joint in snake.joints
+    )
     gait = dataclasses.replace(gait, groups=groups, windows=windows)
     write_csv([dataclasses.replace(snake, gait=gait, joints=joints)], tmp_path / "x.csv")
     table = pd.read_csv(tmp_path / "x.csv")

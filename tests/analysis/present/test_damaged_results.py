@@ -33,7 +33,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("other", OTHERS, ids=repr)
 def test_whatever_stands_there_it_is_a_result_or_a_sentence(other, whole, tmp_path):
     path, refused = tmp_path / "x.json", 0
-    found = [one for one in places(whole) if one]
+    found = [place for place in places(whole) if place]
     for place in found[:: max(1, len(found) // 15)]:
         data = json.loads(json.dumps(whole))
         node = data
@@ -56,7 +56,9 @@ def test_a_text_is_no_list_of_letters(tmp_path):
     make_single().save(path)
     data = json.loads(path.read_text())
     lists = [
-        one for one in places(data) if one and isinstance(_at(data, one), list) and _at(data, one)
+        place
+        for place in places(data)
+        if place and isinstance(_at(data, place), list) and _at(data, place)
     ]
     assert lists
     for place in lists:

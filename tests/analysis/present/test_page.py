@@ -272,8 +272,8 @@ def test_the_page_is_small_and_the_same_for_the_same_input(snake, snake_page):
 
 def test_coupling_that_was_identified_is_drawn_and_listed(single):
     matrix = ((0.8, -0.2), (0.1, 0.9))
-    known = Coupling(True, "local kicks around one gait", None, matrix, 3.4)
-    root = tree(render(dataclasses.replace(single, coupling=known)))
+    coupling = Coupling(True, "local kicks around one gait", None, matrix, 3.4)
+    root = tree(render(dataclasses.replace(single, coupling=coupling)))
     shown = [[numbers(cell)[0] for cell in row[1:]] for row in rows(root, "coupling")[1:]]
     assert shown == [list(row) for row in matrix]
     assert "Coupling: response over command" in [s.children[0].text() for s in root.all("svg")]

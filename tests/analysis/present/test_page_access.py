@@ -64,7 +64,7 @@ def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     assert roles["main"] == roles["contentinfo"] == roles["navigation"] == 1
     regions = [name for role, name, _ in found if role == "region"]
     assert [regions.index(part) for part in ("Question", "Answer")] == [0, 1]
-    assert [one for one in regions if one in ("Evidence", "Limits", "Method")] == [
+    assert [region for region in regions if region in ("Evidence", "Limits", "Method")] == [
         *("Evidence", "Limits", "Method")
     ]
     levels = [properties["level"] for role, _, properties in found if role == "heading"]

@@ -29,12 +29,12 @@ def pages(both_ways, kicked, swept):
 
 def rows(page, table):
     """Numbers in the cells of a table's body, row by row."""
-    found = re.search(rf'<table class="{table}">.*?<tbody>(.*?)</tbody>', page, re.DOTALL)
+    match = re.search(rf'<table class="{table}">.*?<tbody>(.*?)</tbody>', page, re.DOTALL)
     return [
         [[float(v) for v in re.findall(r'<data value="([^"]+)"', cell)] for cell in cells]
         for cells in (
             re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.DOTALL)
-            for row in re.findall(r"<tr>(.*?)</tr>", found[1], re.DOTALL)
+            for row in re.findall(r"<tr>(.*?)</tr>", match[1], re.DOTALL)
         )
     ]
 
@@ -77,7 +77,9 @@ def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
     shown = rows(pages["kicked"], "coupling")
     assert [[cell[0] for cell in row[1:]] for row in shown] == list(map(list, coupling.P.value))
     sums = rows(pages["kicked"], "rows")
-    assert [row[1][0] for row in sums] == [one.total.value for one in coupling.phase_rows]
+    assert [row[1][0] for row in sums] == [
+        phase_row.total.value for phase_row in coupling.phase_rows
+    ]
     held = rows(pages["kicked"], "heldout")
     assert [row[2][0] for row in held] == [100 * one.error for one in coupling.held_out]
 
@@ -111,10 +113,13 @@ def test_every_matrix_has_a_picture_and_a_table(pages):
 
 
 def test_tests_answer_in_words(both_ways, kicked, snake):
-    trials = {one.question: one for one in experiment_trials(both_ways)}
+    trials = {
+        experiment_trial.question: experiment_trial
+        for experiment_trial in experiment_trials(both_ways)
+    }
     mirror = trials["Do the modules mirror, as identical ones do? (H1, reversal)"]
     assert (mirror.p, mirror.verdict) == (both_ways.reversal.p, "no, modules differ")
-    verdicts = [one.verdict for one in experiment_trials(kicked)]
+    verdicts = [experiment_trial.verdict for experiment_trial in experiment_trials(kicked)]
     assert verdicts[:2] == ["as any settled gait's do"] * 2
     assert verdicts[2] == "a deviation could not be shown"
     assert verdicts[3].startswith("yes, up to 0.")

@@ -128,7 +128,7 @@ def test_artefacts_are_one_row_a_stretch_and_oscillators_one_row_a_link(snake, k
     assert frames["oscillator_rates"]["omega_rad_s"].tolist() == [3.1]
     assert "oscillators" not in snake.frames()
     modes = kicked.frames()["modes"]
-    assert modes["real"].tolist() == [one.real.value for one in kicked.oscillators.modes]
+    assert modes["real"].tolist() == [mode.real.value for mode in kicked.oscillators.modes]
 
 
 def test_a_coupling_is_one_row_a_pair(kicked):

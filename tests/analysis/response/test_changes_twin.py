@@ -20,9 +20,9 @@ def test_a_short_session_gives_what_a_long_one_settles_at(name, tmp_path):
     path = tmp_path / f"{name}.mcap"
     record(load_scenario(name).changed(duration_s=40.0), path, kernels=Kernels.NUMBA)
     truth = {
-        one.name: (one.gain.value, one.lag_rad.value)
-        for one in analysed(path, Options(start_s=24.0)).joints
-        if one.gain.value is not None
+        joint.name: (joint.gain.value, joint.lag_rad.value)
+        for joint in analysed(path, Options(start_s=24.0)).joints
+        if joint.gain.value is not None
     }
     for start_s, cycles in ((1.0, 6), (1.0, 10), (2.0, 8)):
         short = analysed(path, Options(start_s=start_s, stop_s=start_s + cycles / 0.5))

@@ -37,10 +37,10 @@ def multisine(period):
     ],
 )
 def test_each_kind_is_found(kind, values):
-    found = find_excitation(Series("u", T, values))
-    assert found.kind is kind
+    excitation = find_excitation(Series("u", T, values))
+    assert excitation.kind is kind
     if kind is Kind.PERIODIC:
-        assert found.period_s == pytest.approx(12.0, abs=0.005)
+        assert excitation.period_s == pytest.approx(12.0, abs=0.005)
 
 
 def test_what_never_moves_excites_nothing():
@@ -58,17 +58,17 @@ def test_a_gap_that_is_longer_than_the_record_is_no_excitation_to_measure(gap_s)
 def test_a_binary_sequence_that_repeats_is_periodic(chip, count):
     once = np.repeat(signal.max_len_seq(6)[0] * 2.0 - 1, chip)
     values = np.tile(once, 5)[: int(count * once.size)]
-    found = find_excitation(Series("u", np.arange(values.size) * 0.01, values))
-    assert found.kind is Kind.PERIODIC
-    assert found.period_s == pytest.approx(once.size * 0.01, rel=1e-9)
+    excitation = find_excitation(Series("u", np.arange(values.size) * 0.01, values))
+    assert excitation.kind is Kind.PERIODIC
+    assert excitation.period_s == pytest.approx(once.size * 0.01, rel=1e-9)
 
 
 def test_a_period_may_end_between_two_samples():
     lines, period_s, t = np.arange(1, 60, 2), 7.8937, np.arange(0.0, 40.0, 0.02)
     turns = 2 * np.pi * np.outer(t, lines) / period_s + 6.28 * RNG.random(lines.size)
-    found = find_excitation(Series("u", t, np.cos(turns).sum(axis=1)))
-    assert found.kind is Kind.PERIODIC
-    assert found.period_s == pytest.approx(period_s, rel=1e-6)
+    excitation = find_excitation(Series("u", t, np.cos(turns).sum(axis=1)))
+    assert excitation.kind is Kind.PERIODIC
+    assert excitation.period_s == pytest.approx(period_s, rel=1e-6)
 
 
 def test_a_strong_line_is_not_taken_for_the_period():
@@ -77,6 +77,6 @@ def test_a_strong_line_is_not_taken_for_the_period():
     values = np.cos(2 * np.pi * 40 * t / period_s)
     for line in (3, 7, 11, 16):
         values = values + 0.04 * np.cos(2 * np.pi * line * t / period_s + line)
-    found = find_excitation(Series("u", t, values))
-    assert found.kind is Kind.PERIODIC
-    assert found.period_s == pytest.approx(period_s, rel=1e-6)
+    excitation = find_excitation(Series("u", t, values))
+    assert excitation.kind is Kind.PERIODIC
+    assert excitation.period_s == pytest.approx(period_s, rel=1e-6)

@@ -113,7 +113,7 @@ def halves_of(command, response):
     start, stop = command.t_s[0], command.t_s[-1]
     limits = (start, (start + stop) / 2), ((start + stop) / 2, stop)
     return [
-        estimate(command.between(*each), response.between(*each), excitation) for each in limits
+        estimate(command.between(*limit), response.between(*limit), excitation) for limit in limits
     ]
 
 

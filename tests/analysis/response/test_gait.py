@@ -50,7 +50,7 @@ def test_what_is_no_gait():
         lambda t, i: np.sin(2 * np.pi * 0.2 * t),
     ):
         notes = []
-        named = {one.name: one for one in channels(make)}
+        named = {channel.name: channel for channel in channels(make)}
         assert fit_gait(named, named, 10.0, notes.append) is None
         assert notes[0].startswith("no gait")
 

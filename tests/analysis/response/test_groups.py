@@ -132,7 +132,7 @@ def test_mixed_tones_of_lowest_order():
         ([GOLDEN, 1.0], []),
     ):
         tones = mixed_tones(omegas, 2 * np.pi * 100)
-        assert [(one.group, dict(one.factors)) for one in tones] == expected
+        assert [(tone.group, dict(tone.factors)) for tone in tones] == expected
 
 
 def test_lines_of_the_other_groups_are_distinct():
@@ -211,8 +211,10 @@ def test_one_gait_is_not_split_by_noise_modulation_or_harmonics(seed):
         np.sin(omega * t + 0.5 * np.sin(0.5 * t) - k),
         0.6 * wave + np.sin(2 * (omega * t - k)) * (k < 4),
     ):
-        found = find_groups([Series(f"j{i}", t, one) for i, one in enumerate(commands)], 15.0)
-        assert (len(found.rhythms), found.unresolved) == (1, ())
+        groups = find_groups(
+            [Series(f"j{i}", t, command) for i, command in enumerate(commands)], 15.0
+        )
+        assert (len(groups.rhythms), groups.unresolved) == (1, ())
 
 
 def test_too_slow_or_too_few_samples_for_a_group_are_reported():

@@ -63,7 +63,7 @@ def test_an_interval_that_excludes_zero_is_printed_so(end, ratio, negative):
     low, high = (-ratio * end, -end) if negative else (end, ratio * end)
     text = formats.estimate(Estimate((low + high) / 2, (low, high)), most=1)
     ends = text.replace(formats.MINUS, "-").partition("[")[2].rstrip("]").split(", ")
-    assert all(float(one) != 0 for one in ends)
+    assert all(float(end) != 0 for end in ends)
 
 
 @pytest.mark.parametrize(

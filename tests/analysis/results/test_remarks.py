@@ -27,7 +27,7 @@ def test_worst_first_and_each_once():
     assert remarks.warnings(["cut short"]) == ("no gait", "cut short", "late")
     assert remarks.notes == ("no topic",)
     assert json.dumps([*remarks.warnings(), *remarks.notes]) == '["no gait", "late", "no topic"]'
-    assert {type(one) for one in (*remarks.warnings(), *remarks.notes)} == {str}
+    assert {type(warning) for warning in (*remarks.warnings(), *remarks.notes)} == {str}
 
 
 def test_topics_that_were_not_recorded_are_no_warnings(tmp_path, opened):

@@ -166,7 +166,7 @@ def test_a_smooth_profile_is_a_shape_and_names_nobody(shape, kind):
     one = profile(np.random.default_rng(7), 0.5 + shape(np.linspace(-1, 1, 13)))
     critical = critical_value([family_of(one)], draws=300)
     assert standing_out(one, critical) == []
-    found = {each.kind: each for each in contrasts(one, np.ones(13, bool))}
+    found = {contrast.kind: contrast for contrast in contrasts(one, np.ones(13, bool))}
     assert abs(found[kind].value) > critical * found[kind].error
 
 

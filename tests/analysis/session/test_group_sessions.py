@@ -39,8 +39,8 @@ def slither(tmp_path_factory):
 @pytest.mark.slow
 def test_every_joint_is_compared_at_its_own_frequency(slither):
     result = analysed(slither)
-    assert [len(one.joints) for one in result.gait.groups] == [8, 8]
-    found = {one.joints[0]: one for one in result.gait.groups}
+    assert [len(group.joints) for group in result.gait.groups] == [8, 8]
+    found = {group.joints[0]: group for group in result.gait.groups}
     for joint, frequency in (("joint01", 1.432), ("joint02", 0.954)):
         group = found[joint]
         assert group.frequency_hz.value == pytest.approx(frequency, rel=1e-9)
@@ -107,7 +107,9 @@ def test_the_reversal_takes_all_groups_together(tmp_path):
     result = experiment(runs(tmp_path, weak=0.95 * np.exp(-0.03j)))
     assert result.reversal is not None
     assert result.reversal.p < 0.01
-    assert [one.name for one in result.reversal.joints][:4] == [f"joint0{k}" for k in range(1, 5)]
+    assert [joint.name for joint in result.reversal.joints][:4] == [
+        f"joint0{k}" for k in range(1, 5)
+    ]
     assert min(result.reversal.joints, key=lambda one: one.p).name in ("joint03", "joint07")
 
 

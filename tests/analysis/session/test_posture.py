@@ -11,7 +11,7 @@ from undulog.capture import Session, SessionWriter, load_robot
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")
-(IMU,) = [one for one in ROBOT.sensors if one.kind == "accelerometer"]
+(IMU,) = [sensor for sensor in ROBOT.sensors if sensor.kind == "accelerometer"]
 WINDOWS = (Window(1.0, 3.0, 2.0),)
 
 

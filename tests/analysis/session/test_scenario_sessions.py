@@ -43,7 +43,7 @@ def analysed(name, folder, longest_s=LONGEST_S):
 
 def holds_the_bar(figures):
     assert set(figures.errors) == {"net", "plus", "abs", "el", "el_clipped"}
-    assert max(abs(one) for one in figures.errors.values()) <= energy_tables.BAR, figures.errors
+    assert max(abs(error) for error in figures.errors.values()) <= energy_tables.BAR, figures.errors
 
 
 def test_all_shipped_scenarios_are_here():
@@ -77,7 +77,11 @@ def test_the_page_has_every_scenario_within_the_bar():
 
 
 def sensor_flags(result):
-    return [(one.joint, one.flag) for one in result.artefacts if one.about == "sensor"]
+    return [
+        (artefact.joint, artefact.flag)
+        for artefact in result.artefacts
+        if artefact.about == "sensor"
+    ]
 
 
 @pytest.mark.built("tables")

@@ -227,7 +227,7 @@ def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
     same = "joint03, joint07: position on /joint_states: values stay exactly the same"
     for beginning in (same, "joint05: no response"):
         assert any(text.startswith(beginning) for text in result.warnings)
-    assert [(one.joint, one.flag, one.about) for one in result.artefacts] == [
+    assert [(artefact.joint, artefact.flag, artefact.about) for artefact in result.artefacts] == [
         ("joint03", "frozen", "sensor or joint"),
         ("joint07", "frozen", "sensor or joint"),
     ]

@@ -45,7 +45,7 @@ def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path, opened)
         return analyse_session(opened(path), options)
 
     def of_sensors(result):
-        return [one for one in result.artefacts if one.about == "sensor"]
+        return [artefact for artefact in result.artefacts if artefact.about == "sensor"]
 
     motor = analysed("/motor", "/motor")
     assert of_sensors(motor) == []
@@ -74,7 +74,7 @@ def rows(name, *columns):
     with (SO101 / name).open(newline="") as file:
         read = list(csv.DictReader(file))
     t_ns = [EPOCH_NS + round(float(row["timestamp"]) * 1e3) for row in read]
-    return t_ns, [np.array([json.loads(row[one]) for row in read]) for one in columns]
+    return t_ns, [np.array([json.loads(row[column]) for row in read]) for column in columns]
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +97,13 @@ def arm(tmp_path_factory):
 @pytest.mark.nightly
 def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
     assert all(joint.gain.value is not None for joint in arm.joints)
-    wrong = {(one.joint, one.quantity, one.flag) for one in arm.artefacts if one.about == "sensor"}
+    wrong = {
+        (artefact.joint, artefact.quantity, artefact.flag)
+        for artefact in arm.artefacts
+        if artefact.about == "sensor"
+    }
     assert wrong == {("Jaw", "velocity", "scale_mismatch")}  # by 2.343: of the data set itself
-    (jaw,) = (one for one in arm.artefacts if one.about == "sensor")
+    (jaw,) = (artefact for artefact in arm.artefacts if artefact.about == "sensor")
     assert float(jaw.note.split()[0]) == pytest.approx(2.343, rel=0.01)
 
 

@@ -68,9 +68,9 @@ def decoded(robot, frames):
     samples, tally = BusDecoder(robot).decode(frames)
     assert tally.decoded == len(frames)
     return {
-        (one.signals[k].target, one.signals[k].quantity, one.signals[k].axis): value
-        for one in samples
-        for k, value in zip(one.member.tolist(), one.values.tolist(), strict=True)
+        (sample.signals[k].target, sample.signals[k].quantity, sample.signals[k].axis): value
+        for sample in samples
+        for k, value in zip(sample.member.tolist(), sample.values.tolist(), strict=True)
     }
 
 

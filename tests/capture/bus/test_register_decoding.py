@@ -42,9 +42,9 @@ def decoded(robot, protocol, packets, pieces=1):
     for part in np.array_split(records, pieces):
         samples, count = decoder.decode(part)
         counts.append(count)
-        for one in samples:
-            for m, t, value in zip(one.member, one.t_ns, one.values, strict=True):
-                key = (one.signals[m].target, one.signals[m].quantity.value)
+        for sample in samples:
+            for m, t, value in zip(sample.member, sample.t_ns, sample.values, strict=True):
+                key = (sample.signals[m].target, sample.signals[m].quantity.value)
                 found.append((*key, (int(t) - 10**9) // 10**6, value))
     total = counts[0]
     for count in counts[1:]:

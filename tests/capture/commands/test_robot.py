@@ -23,7 +23,7 @@ def write(path, names=("hip", "knee"), **options):
 def test_list_and_show_name_the_shipped_robots(report_of, command):
     assert [one["name"] for one in report_of("robot", "list")] == list(robot_names())
     facts = report_of("robot", "show", "snake25")
-    assert [one["name"] for one in facts["joints"]] == list(load_robot("snake25").joint_names)
+    assert [fact["name"] for fact in facts["joints"]] == list(load_robot("snake25").joint_names)
     text = command("robot", "show", "snake25").out
     assert all(name in text for name in load_robot("snake25").joint_names)
     assert "1000000 bit/s" in text
@@ -101,4 +101,6 @@ def test_a_log_with_a_robot_keeps_it():
         assert session.robot.name == "snake25"
         assert any("snake13" in warning for warning in session.warnings)
     with GOLDEN.open("rb") as stream:  # as another reader sees it
-        assert {one.name for one in make_reader(stream).iter_attachments()} >= {"robot.toml"}
+        assert {attachment.name for attachment in make_reader(stream).iter_attachments()} >= {
+            "robot.toml"
+        }

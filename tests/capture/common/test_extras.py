@@ -24,8 +24,12 @@ def test_the_extras_are_those_of_the_project_and_all_is_all_of_them():
 
 def test_packages_of_an_extra_are_those_that_this_python_needs():
     for extra in EXTRAS:
-        wanted = [Requirement(line) for line in DECLARED[extra]]
-        here = {r.name.replace(".", "-") for r in wanted if r.marker is None or r.marker.evaluate()}
+        requirements = [Requirement(line) for line in DECLARED[extra]]
+        here = {
+            r.name.replace(".", "-")
+            for r in requirements
+            if r.marker is None or r.marker.evaluate()
+        }
         assert set(extra_packages(extra)) == here
 
 

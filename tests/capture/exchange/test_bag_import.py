@@ -132,10 +132,10 @@ def test_a_set_of_joints_that_changes_has_gaps(tmp_path):
     """One joint a message, and one more halfway: none is lost, and none is made up."""
 
     def fill(bag):
-        own = Filler(bag)
+        filler = Filler(bag)
         for k, (t_ns, t_s) in enumerate(ticks(2.0)):
             at = k % 2 if k < 100 else k % 3
-            own.state(t_ns, t_s, positions=[commanded(t_s)[at]], names=[NAMES[at]])
+            filler.state(t_ns, t_s, positions=[commanded(t_s)[at]], names=[NAMES[at]])
 
     bag = write_bag(tmp_path / "bag", fill)
     import_bag(bag, tmp_path / "x.mcap")
@@ -245,12 +245,12 @@ def test_damaged_messages_are_read_or_counted(topic, tmp_path):
             self._writer.write(way, t_ns, bytes(data))
 
     def fill(bag):
-        own = Filler(bag)
+        filler = Filler(bag)
         bag.writer = Damaging(bag.writer)
         for tick in ticks(1.0):
-            own.trajectory(*tick, count=4)
-            own.controller(*tick)
-            own.dynamic(*tick, "/states")
+            filler.trajectory(*tick, count=4)
+            filler.controller(*tick)
+            filler.dynamic(*tick, "/states")
 
     bag = write_bag(tmp_path / "bag", fill)
     name = f"{topic}.feedback" if topic.endswith("controller_state") else topic

@@ -47,7 +47,9 @@ def states_by_mcap(path):
 
 def states_by_rosbags(path):
     with AnyReader([path], default_typestore=get_typestore(Stores.EMPTY)) as reader:
-        ways = [each for each in reader.connections if each.topic == "/joint_states"]
+        ways = [
+            connection for connection in reader.connections if connection.topic == "/joint_states"
+        ]
         rows = [
             (t, reader.deserialize(data, way.msgtype).position)
             for way, t, data in reader.messages(ways)

@@ -56,14 +56,15 @@ def test_each_path_of_foxglove_leads_to_its_joint(run, tmp_path, command):
     with run.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         first = {
-            each.channel.topic: each.decoded_message for each in reader.iter_decoded_messages()
+            decoded.channel.topic: decoded.decoded_message
+            for decoded in reader.iter_decoded_messages()
         }
     for joint, name in zip(NAMES, shown, strict=True):
         panel = layout["configById"][name]
         assert panel["title"] == f"{joint} [rad]"
-        found = [FOXGLOVE.fullmatch(path["value"]) for path in panel["paths"]]
-        assert [each["topic"] for each in found] == ["/joint_commands", "/joint_states"]
-        for each in found:
+        matches = [FOXGLOVE.fullmatch(path["value"]) for path in panel["paths"]]
+        assert [each["topic"] for each in matches] == ["/joint_commands", "/joint_states"]
+        for each in matches:
             assert first[each["topic"]].name[int(each["place"])] == joint
 
 

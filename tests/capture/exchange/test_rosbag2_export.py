@@ -41,7 +41,7 @@ def test_messages_are_those_of_the_session_byte_for_byte(bag, tmp_path):
     assert sum(report.facts["messages"].values()) == len(expected)
     with Reader(folder) as reader:
         by_rosbags = [(c.msgtype, c.topic, t, bytes(data)) for c, t, data in reader.messages()]
-        counts = {each.topic: each.msgcount for each in reader.connections}
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
     assert sorted(by_rosbags) == sorted((n, t, log, data) for n, t, log, _, data in expected)
     assert counts == report.facts["messages"]
 
@@ -71,7 +71,10 @@ def test_rosbags_decodes_every_type(bag):
 
 def test_a_topic_whose_last_message_stays_valid_is_offered_so(bag):
     with Reader(bag[0]) as reader:
-        offered = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}
+        offered = {
+            connection.topic: connection.ext.offered_qos_profiles
+            for connection in reader.connections
+        }
     assert [each.durability for each in offered["/gait/mode"]] == [QosDurability.TRANSIENT_LOCAL]
     assert offered["/joint_states"] == []
 

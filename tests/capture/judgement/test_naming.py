@@ -70,7 +70,7 @@ def test_in_a_uniform_gait_of_whole_waves_a_shift_and_a_lag_are_both_stated(join
     found = told(*run(joints, 2 * np.pi / joints, shifted(joints)))
     assert found.verdict is Verdict.EITHER
     assert found.permutation is None
-    kinds = [one.kind for one in found.alternatives]
+    kinds = [alternative.kind for alternative in found.alternatives]
     assert kinds == [Kind.PERMUTED, Kind.AS_NAMED]
     assert found.alternatives[0].permutation == shifted(joints)
     late = found.alternatives[1].delay_s - found.alternatives[0].delay_s
@@ -107,7 +107,10 @@ def test_two_swapped_joints_are_a_permutation_of_two(joints, pair):
 def test_neighbours_whose_commands_hardly_differ_are_swapped_or_have_lags_of_their_own():
     found = told(*run(8, 0.35, swapped(8, 3, 4), spread=0.0))
     assert found.verdict is Verdict.EITHER
-    assert {one.kind for one in found.alternatives} == {Kind.PERMUTED, Kind.OWN_LAGS}
+    assert {alternative.kind for alternative in found.alternatives} == {
+        Kind.PERMUTED,
+        Kind.OWN_LAGS,
+    }
     assert "m3 and m4 carry out each other's command" in in_words(
         found, [f"m{k}" for k in range(8)]
     )
@@ -136,7 +139,10 @@ def test_identical_commands_tell_nothing_and_are_named():
 def test_in_a_standing_wave_two_swapped_and_two_inverted_joints_are_both_stated():
     found = told(*run(8, np.pi, swapped(8, 0, 1)))
     assert found.verdict is Verdict.EITHER
-    assert {one.kind for one in found.alternatives} == {Kind.PERMUTED, Kind.INVERTED}
+    assert {alternative.kind for alternative in found.alternatives} == {
+        Kind.PERMUTED,
+        Kind.INVERTED,
+    }
     assert found.interchangeable == ((0, 2, 4, 6), (1, 3, 5, 7))
     words = in_words(found, [f"m{k}" for k in range(8)])
     assert "m0 and m1 carry out each other's command" in words
@@ -181,7 +187,10 @@ def test_a_late_end_joint_of_soft_servos_is_late_or_the_names_are_shifted():
     """A lag of all beyond the phase of a joint, and an end joint that is nearly at the first's."""
     found = told(*run(8, 0.6, lag=0.75, lags=np.array([0, 0, 0, 0, 0, 0, 0, 1.75]), spread=0.0))
     assert found.verdict is Verdict.EITHER
-    assert {one.kind for one in found.alternatives} == {Kind.PERMUTED, Kind.OWN_LAGS}
+    assert {alternative.kind for alternative in found.alternatives} == {
+        Kind.PERMUTED,
+        Kind.OWN_LAGS,
+    }
     assert found.decided_by == (7,)
 
 
@@ -303,7 +312,7 @@ def test_of_two_hundred_drawn_permutations_four_fifths_stand_and_few_others_do(t
     for seed in range(200):
         arrays, order = drawn(seed, truth)
         found = told(*arrays)
-        stands = any(one.permutation == order for one in found.alternatives)
+        stands = any(alternative.permutation == order for alternative in found.alternatives)
         right += stands and found.verdict is not Verdict.FITS
         wrong += found.verdict is Verdict.PERMUTED and not stands
     assert right >= 160

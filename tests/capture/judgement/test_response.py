@@ -42,24 +42,24 @@ def spoil(position, faulty, first):
 def test_gain_offset_and_lag_are_those_of_the_servo(name, delay_s, constant_s):
     noise = 0.002 * np.random.default_rng(1).normal(size=T.size)
     position = 0.85 * servo(COMMANDS[name], delay_s, constant_s) + 0.04 + noise
-    found = fit_response(COMMANDS[name], position, np.ones(T.size, bool), STEP)
+    response = fit_response(COMMANDS[name], position, np.ones(T.size, bool), STEP)
     truth = Response(1.0, 0.0, delay_s, constant_s, order=1)
     if name == "sine":  # at one frequency a delay and a pole replace each other
-        assert at(0.6, found) == pytest.approx(0.85 * at(0.6, truth), rel=0.01)
+        assert at(0.6, response) == pytest.approx(0.85 * at(0.6, truth), rel=0.01)
     else:
-        assert found.gain == pytest.approx(0.85, rel=0.02)
-        assert found.lag_s == pytest.approx(truth.lag_s, abs=0.012)
-    assert found.offset_rad == pytest.approx(0.04, abs=0.003)
-    assert found.explained > 0.99
+        assert response.gain == pytest.approx(0.85, rel=0.02)
+        assert response.lag_s == pytest.approx(truth.lag_s, abs=0.012)
+    assert response.offset_rad == pytest.approx(0.04, abs=0.003)
+    assert response.explained > 0.99
 
 
 @pytest.mark.parametrize("faulty", ["held", "mirrored"])
 @pytest.mark.parametrize("first", [0.0, 0.33, 0.66])
 def test_a_third_of_the_record_may_be_faulty(faulty, first):
     position = spoil(0.9 * servo(COMMANDS["sine"], 0.05, 0.0), faulty, first)
-    found = fit_response(COMMANDS["sine"], position, np.ones(T.size, bool), STEP)
-    assert found.gain == pytest.approx(0.9, rel=0.03)
-    assert found.lag_s == pytest.approx(0.05, abs=0.012)
+    response = fit_response(COMMANDS["sine"], position, np.ones(T.size, bool), STEP)
+    assert response.gain == pytest.approx(0.9, rel=0.03)
+    assert response.lag_s == pytest.approx(0.05, abs=0.012)
 
 
 def test_a_joint_that_stands_has_no_gain_and_an_inverted_one_a_negative_gain():

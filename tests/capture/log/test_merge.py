@@ -47,35 +47,35 @@ def test_cuts_side_by_side_make_the_whole_again(tmp_path_factory, times, bounds,
 
 
 def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path):
-    one = write_log(tmp_path / "one.mcap", [("/a", t * MS, f"one {t}") for t in (0, 2, 2, 4, 9)])
+    log = write_log(tmp_path / "one.mcap", [("/a", t * MS, f"one {t}") for t in (0, 2, 2, 4, 9)])
     texts = [("/b", t * MS, f"two {t}") for t in (1, 2, 4, 5)]
     two = write_log(tmp_path / "two.mcap", texts, use_chunking=False)
     three = write_log(tmp_path / "three.mcap", [("/c", 2 * MS, "three")], **MAKES["lz4"])
-    merge_logs([one, two, three], tmp_path / "all.mcap")
+    merge_logs([log, two, three], tmp_path / "all.mcap")
     found = read(tmp_path / "all.mcap", log_time_order=False)
     assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in found] == [
         *[("/a", 0), ("/b", 1), ("/a", 2), ("/a", 2), ("/b", 2), ("/c", 2)],
         *[("/a", 4), ("/b", 4), ("/b", 5), ("/a", 9)],
     ]
-    assert sorted(found) == sorted(m for path in (one, two, three) for m in read(path))
+    assert sorted(found) == sorted(m for path in (log, two, three) for m in read(path))
 
 
 def test_a_topic_of_several_logs_becomes_one_channel(tmp_path):
-    one = write_log(tmp_path / "one.mcap", ticks(50))
+    log = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=5000))
-    report = merge_logs([one, two], tmp_path / "both.mcap")
+    report = merge_logs([log, two], tmp_path / "both.mcap")
     assert report.warnings == []
     assert report.messages == {"/a": 50, "/b": 50}
     summary = summary_of(tmp_path / "both.mcap")
     assert sorted(c.topic for c in summary.channels.values()) == ["/a", "/b"]
     assert len(summary.schemas) == 1
-    assert read(tmp_path / "both.mcap") == read(one) + read(two)
+    assert read(tmp_path / "both.mcap") == read(log) + read(two)
 
 
 def test_a_merge_warns_when_the_same_topics_overlap(tmp_path):
-    one = write_log(tmp_path / "one.mcap", ticks(50))
+    log = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=405))
-    warnings = merge_logs([one, two], tmp_path / "both.mcap").warnings
+    warnings = merge_logs([log, two], tmp_path / "both.mcap").warnings
     assert ["overlap by 0.09 s" in text for text in warnings] == [True]
 
 
@@ -117,20 +117,20 @@ def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path):
 
 
 def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path, command):
-    one = write_log(tmp_path / "one.mcap", ticks(20), units={"/b": "rad"})
+    log = write_log(tmp_path / "one.mcap", ticks(20), units={"/b": "rad"})
     two = write_log(tmp_path / "two.mcap", ticks(20), units={"/b": "deg"})
     with pytest.raises(DataError, match=r"^/b is in rad in .*one.mcap and in deg in .*two"):
-        merge_logs([one, two], tmp_path / "both.mcap")
+        merge_logs([log, two], tmp_path / "both.mcap")
     silent = write_log(tmp_path / "silent.mcap", ticks(20))  # of another make, without units
-    merge_logs([one, silent], tmp_path / "both.mcap")
+    merge_logs([log, silent], tmp_path / "both.mcap")
     (tmp_path / "both.mcap").unlink()
     path = tmp_path / "three.mcap"
     with foreign_log(path, "sensor_msgs/msg/Range") as (writer, schema):
         writer.add_message(writer.register_channel("/a", "cdr", schema), EPOCH_NS, b"", 0)
-    refused = command("log", "merge", one, path, "-o", tmp_path / "x.mcap", code=1).err
+    refused = command("log", "merge", log, path, "-o", tmp_path / "x.mcap", code=1).err
     assert "/a is std_msgs/msg/String" in refused
     assert "sensor_msgs/msg/Range in" in refused
-    assert set(tmp_path.iterdir()) == {one, two, silent, path}
+    assert set(tmp_path.iterdir()) == {log, two, silent, path}
 
 
 def test_a_definition_with_other_comments_is_the_same_type(tmp_path, opened):
@@ -167,9 +167,9 @@ def test_a_merge_of_different_robots_needs_the_name_of_one(tmp_path, command):
 
 
 def test_a_merge_refuses_one_log_and_the_same_log(tmp_path):
-    one = write_log(tmp_path / "one.mcap", ticks(20))
-    (tmp_path / "copy.mcap").write_bytes(one.read_bytes())
+    log = write_log(tmp_path / "one.mcap", ticks(20))
+    (tmp_path / "copy.mcap").write_bytes(log.read_bytes())
     with pytest.raises(UsageError, match="two logs or more"):
-        merge_logs([one], tmp_path / "both.mcap")
+        merge_logs([log], tmp_path / "both.mcap")
     with pytest.raises(UsageError, match="byte for byte"):
-        merge_logs([one, tmp_path / "copy.mcap"], tmp_path / "both.mcap")
+        merge_logs([log, tmp_path / "copy.mcap"], tmp_path / "both.mcap")

@@ -215,7 +215,7 @@ def test_packets_of_a_line_are_decoded_in_its_order_and_frames_in_that_of_time(s
     assert seen == [[EPOCH_NS + t_ns for t_ns in order]]
     stage.writer.close()
     with Session(stage.path) as session:
-        topics = {topic for topic, one in session.channels.items() if one.count}
+        topics = {topic for topic, channel in session.channels.items() if channel.count}
     assert topics == {"/serial/b" if serial else "/can_fd/b"}
 
 
@@ -231,6 +231,6 @@ def test_frames_of_both_kinds_have_their_channels_and_4096_a_message(stage_of):
     assert stage.bus.backlog == 2 * 4097 + 2 * 4096
     stage.writer.close()
     with Session(stage.path) as session:
-        counts = {topic: one.count for topic, one in session.channels.items()}
+        counts = {topic: channel.count for topic, channel in session.channels.items()}
         assert len(session.frames("/can/b")) == 2 * 4097
     assert counts == {"/can/b": 2 + 2, "/can_fd/b": 4}

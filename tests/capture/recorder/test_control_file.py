@@ -177,11 +177,11 @@ def test_the_usual_place_and_finding_what_runs(tmp_path):
         dead.bind(str(stale))
     (path.parent / "file.sock").write_text("")
     (path.parent / "service").mkdir()
-    one = ControlServer(path, echo)
+    server = ControlServer(path, echo)
     two = ControlServer(path.parent / "service" / "a.sock", echo)
     found = [p for p in control_client.find_sockets(environ) if tmp_path in p.parents]
     assert found == sorted([path, path.parent / "service" / "a.sock"])
-    one.close()
+    server.close()
     two.close()
     assert [p for p in control_client.find_sockets(environ) if tmp_path in p.parents] == []
 

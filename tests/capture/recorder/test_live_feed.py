@@ -138,7 +138,7 @@ def test_datagram_comes_back_as_it_was(fields, dropped):
     head = live_wire.DatagramHead(live_wire.Kind.MESSAGES, len(fields), 7, dropped)
     data = live_wire.pack_datagram(head, map(live_wire.pack_message, fields))
     assert live_wire.read_head(data) == head
-    assert live_wire.read_records(data) == [live_wire.LiveMessage(*one) for one in fields]
+    assert live_wire.read_records(data) == [live_wire.LiveMessage(*field) for field in fields]
 
 
 @pytest.mark.parametrize("record", DEFINITIONS)
@@ -189,7 +189,7 @@ def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(mak
     for number in range(100, 300):
         offer(feed, number)
     records = all_sent(feed, link)
-    assert [one.sequence for one in messages(records)] == list(range(100, 300))
+    assert [message.sequence for message in messages(records)] == list(range(100, 300))
     assert messages(records)[0][2:4] == (EPOCH_NS + 100 * STEP_NS, EPOCH_NS + 100 * STEP_NS - 5)
     assert (feed.counts.sent, feed.counts.dropped) == (200, 0)
 
@@ -275,7 +275,7 @@ def test_a_message_beyond_a_datagram_is_left_out_and_counted(watched):
     offer(feed, 0, payload=bytes(live_wire.MAX_MESSAGE + 1))
     offer(feed, 1, payload=bytes(live_wire.MAX_MESSAGE))
     offer(feed, 2)
-    assert [one.sequence for one in messages(all_sent(feed, link))] == [1, 2]
+    assert [message.sequence for message in messages(all_sent(feed, link))] == [1, 2]
     assert feed.counts.too_big == 1
 
 
@@ -295,7 +295,7 @@ def test_what_is_dropped_is_always_the_oldest(tmp_path_factory, count, max_messa
         for number in range(count):
             offer(feed, number, payload=bytes(sizes[number % len(sizes)]))
         assert feed.queued <= max_messages
-        numbers = [one.sequence for one in messages(all_sent(feed, link))]
+        numbers = [message.sequence for message in messages(all_sent(feed, link))]
     assert numbers == list(range(count - len(numbers), count))
     assert len(numbers) + feed.counts.dropped == count
     assert numbers
@@ -323,7 +323,7 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
             ticks += 1
     assert ticks == 2000
     assert feed.queued <= 100 + (32 << 10) // 500  # and one datagram
-    numbers = [one.sequence for one in messages(all_sent(feed, link))]
+    numbers = [message.sequence for message in messages(all_sent(feed, link))]
     assert numbers == sorted(numbers)
     assert numbers[-1] == 19_999
     assert len(numbers) + feed.counts.dropped == 20_000
@@ -370,7 +370,7 @@ def test_the_end_is_sent(watched):
     feed.pump()
     assert not feed.connected
     heads, records = received(link)
-    assert [one.sequence for one in messages(records)] == [0]
+    assert [message.sequence for message in messages(records)] == [0]
     assert heads[-1].kind is live_wire.Kind.END
     offer(feed, 1)
     feed.pump()

@@ -141,10 +141,10 @@ def record(path, wrong):
 
 def without_rounding(health):
     """All that was measured; a standard deviation is a difference of sums, so to nine digits."""
-    timings = [each.timing for each in health.series]
+    timings = [series.timing for series in health.series]
     series = tuple(
-        replace(each, timing=replace(timing, std_s=round(timing.std_s or 0.0, 9)))
-        for each, timing in zip(health.series, timings, strict=True)
+        replace(series, timing=replace(timing, std_s=round(timing.std_s or 0.0, 9)))
+        for series, timing in zip(health.series, timings, strict=True)
     )
     rounded = replace(health, series=series)
     names = ("robot", "start_ns", "end_ns", "channels", "joints", "buses", "sources", "findings")
@@ -184,7 +184,9 @@ def test_frames_lost_before_the_recorder_are_held_against_the_session(tmp_path):
     # At tick 700: 700 * 15 taken, 7 * 12 lost.
     loss = "source can0 lost 84 of 10584 frames before the recorder (0.79%)"
     assert checked.reasons == live.reasons == (loss,)
-    assert json.loads(json.dumps([asdict(each) for each in checked.sources]))[0]["dropped"] == 84
+    assert (
+        json.loads(json.dumps([asdict(source) for source in checked.sources]))[0]["dropped"] == 84
+    )
 
 
 def test_a_later_part_answers_for_its_own_losses_only(tmp_path):

@@ -36,7 +36,10 @@ def text(size=1):
 
 
 def counts(health):
-    return {int(one.topic.removeprefix("/text")): one.count for one in health.result().channels}
+    return {
+        int(channel.topic.removeprefix("/text")): channel.count
+        for channel in health.result().channels
+    }
 
 
 # -- rounds ----------------------------------------------------------------------------------------

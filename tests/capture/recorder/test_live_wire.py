@@ -92,8 +92,8 @@ def test_a_datagram_is_read_whole_or_refused_wherever_it_is_cut():
     ends = [24, 60, 97, len(whole)]
     for size in range(24, len(whole) + 1):
         if size in ends:
-            found = read_records(whole[:size])
-            assert [one.payload for one in found] == [b"", b"x", b"yz"][: ends.index(size)]
+            records = read_records(whole[:size])
+            assert [one.payload for one in records] == [b"", b"x", b"yz"][: ends.index(size)]
         else:
             with pytest.raises(DataError, match="cut short"):
                 read_records(whole[:size])
@@ -155,7 +155,7 @@ def test_of_files_and_facts_only_the_robot_s_and_undulog_s_are_sent():
     facts = [Metadata(name, {"a": "1"}) for name in ("undulog", "undulog.clock", "")]
     definitions = kept(*files, *facts)
     assert [one.name for one in sent(definitions)] == ["robot.toml", "a.dbc", "undulog"]
-    assert [definitions.pack(one) is None for one in (*files, *facts)] == [
+    assert [definitions.pack(file) is None for file in (*files, *facts)] == [
         False, False, True, True, True, False, True, True,
     ]  # fmt: skip
 

@@ -207,7 +207,7 @@ def test_two_outputs_of_one_name_in_two_folders(recorder, place, ask):
         (place / folder).mkdir()
         started.append(recorder(f"{folder}/run", "--floor", "0"))
     recordings = json.loads(ask("status", "--json").out)["recordings"]
-    found = {each["output"]: each["socket"] for each in recordings}
+    found = {recording["output"]: recording["socket"] for recording in recordings}
     assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
     assert f"{place}/r/undulog/run.sock" in found.values()
     for socket in found.values():

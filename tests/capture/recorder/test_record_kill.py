@@ -95,13 +95,13 @@ def check_kill(command, folder, path, accepted):
         check_frames(session, accepted)
     files = sorted(folder.glob("repaired*.mcap"))
     for file in files:
-        found = Counter()
+        counter = Counter()
         for _, channel, message in messages_of(file):
-            found[channel.topic] += 1
+            counter[channel.topic] += 1
             dimensions = struct.unpack_from("<I", message.data, 4)[0]
             assert dimensions == 2 or not channel.topic.startswith("/can/")
         with AnyReader([file]) as reader:
-            assert {c.topic: c.msgcount for c in reader.connections if c.msgcount} == found
+            assert {c.topic: c.msgcount for c in reader.connections if c.msgcount} == counter
     return files
 
 

@@ -203,10 +203,10 @@ def test_of_recorders_that_are_given_one_output_at_once_one_records(force, tmp_p
         for name, control in zip(names, controls, strict=True)
     ]
     wait_for(lambda: sum(each.poll() is not None for each in recorders) >= 2, "the others")
-    wait_for(lambda: any(each.exists() for each in controls), "the one that records")
-    for each in recorders:
-        if each.poll() is None:
-            each.send_signal(signal.SIGTERM)
+    wait_for(lambda: any(control.exists() for control in controls), "the one that records")
+    for recorder in recorders:
+        if recorder.poll() is None:
+            recorder.send_signal(signal.SIGTERM)
     said = sorted(each.communicate()[1] for each in recorders)
     refusals = "exists already", "another recorder is writing it"
     refused = [text for text in said if any(words in text for words in refusals)]

@@ -83,6 +83,6 @@ def test_commands_that_come_end_the_waiting_and_their_late_start_is_a_note(tmp_p
         wait_for(lambda: status()["state"] == "recording", "its commands", alive=[recorder])
         ended(recorder, signal.SIGTERM)
     health = check_session(output)
-    starts = [each for each in health.findings if "after the session" in each.sentence]
+    starts = [finding for finding in health.findings if "after the session" in finding.sentence]
     assert starts
-    assert all(each.weight == 0 for each in starts)
+    assert all(start.weight == 0 for start in starts)

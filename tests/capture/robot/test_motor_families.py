@@ -51,9 +51,9 @@ def frame(identifier, data, *, sent=False):
 def decoded(robot, *frames):
     samples, tally = open_decoder(robot).decode(np.concatenate(frames))
     values = {
-        (one.signals[m].target, one.signals[m].quantity.value): value
-        for one in samples
-        for m, value in zip(one.member.tolist(), one.values.tolist(), strict=True)
+        (sample.signals[m].target, sample.signals[m].quantity.value): value
+        for sample in samples
+        for m, value in zip(sample.member.tolist(), sample.values.tolist(), strict=True)
     }
     return values, tally
 

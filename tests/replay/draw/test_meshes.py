@@ -62,15 +62,15 @@ def file(robot, angles, tmp_path_factory):
 
 
 def test_a_mesh_lies_where_its_link_is(file, robot, angles, read_back):
-    found = read_back(file)
+    back = read_back(file)
     head = np.zeros((10, 3)), np.tile(np.eye(3), (10, 1, 1))
     centre, _ = link_poses(robot, *head, angles)
     entity = f"{SHAPES}/link14"
-    at = np.array([row[0] for row in found.column(entity, "Transform3D:translation")])
+    at = np.array([row[0] for row in back.column(entity, "Transform3D:translation")])
     np.testing.assert_allclose(at, centre[::2, 13], atol=1e-6)
-    scale = np.array([row[0] for row in found.column(entity, "Transform3D:scale")])
+    scale = np.array([row[0] for row in back.column(entity, "Transform3D:scale")])
     np.testing.assert_allclose(scale, 0.001, rtol=1e-6)
-    assert len(found.column(entity, "Asset3D:albedo_factor")) == len(at)
+    assert len(back.column(entity, "Asset3D:albedo_factor")) == len(at)
 
 
 def test_only_links_without_a_mesh_are_capsules(file, read_back):

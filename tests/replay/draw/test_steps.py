@@ -63,8 +63,8 @@ def written(session_file, tmp_path_factory, read_back):
     def write(analysis, **options):
         path = tmp_path_factory.mktemp("cycles") / "made.rrd"
         with Session.open(session_file) as session:
-            found = write_recording(session, path, analysis=analysis, **options)
-        return found, read_back(path)
+            recording = write_recording(session, path, analysis=analysis, **options)
+        return recording, read_back(path)
 
     return write
 

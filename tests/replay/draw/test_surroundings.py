@@ -34,15 +34,15 @@ def recorded(snake25, tmp_path):
 
 
 def test_obstacles_and_target_stand_where_the_scenario_has_them(world, recorded, read_back):
-    found = read_back(recorded(load_scenario("target-following").toml().encode()).path)
-    cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
-    walls = [one for one in world.obstacles if isinstance(one, Wall)]
-    radii = found.static("/world/obstacles/cylinders", "Cylinders3D:radii")
-    np.testing.assert_allclose(radii, [one.radius for one in cylinders], rtol=1e-6)
-    half = found.static("/world/obstacles/boxes", "Boxes3D:half_sizes")
-    length = [np.hypot(*np.subtract(one.end, one.start)) for one in walls]
+    back = read_back(recorded(load_scenario("target-following").toml().encode()).path)
+    cylinders = [obstacle for obstacle in world.obstacles if isinstance(obstacle, Cylinder)]
+    walls = [obstacle for obstacle in world.obstacles if isinstance(obstacle, Wall)]
+    radii = back.static("/world/obstacles/cylinders", "Cylinders3D:radii")
+    np.testing.assert_allclose(radii, [cylinder.radius for cylinder in cylinders], rtol=1e-6)
+    half = back.static("/world/obstacles/boxes", "Boxes3D:half_sizes")
+    length = [np.hypot(*np.subtract(wall.end, wall.start)) for wall in walls]
     np.testing.assert_allclose(2 * np.array(half)[:, 0], length, rtol=1e-6)
-    strips = found.static("/world/target", "LineStrips3D:strips")
+    strips = back.static("/world/target", "LineStrips3D:strips")
     away = np.array(strips[0])[:, :2] - world.target.position
     np.testing.assert_allclose(np.hypot(*away.T), world.target.radius, rtol=1e-5)
 

@@ -27,15 +27,15 @@ def stage(tmp_path, session_file):
 
             @staticmethod
             def recorder(session=session_file):
-                one = Recorder(session, socket_path)
-                stack.callback(one.feed.close)
-                return one
+                recorder = Recorder(session, socket_path)
+                stack.callback(recorder.feed.close)
+                return recorder
 
             @staticmethod
             def relay(name="live.rrd", *more):
-                one = Relay(socket_path, tmp_path / name if name else None, *more)
-                stack.callback(one.process.communicate)
-                stack.callback(one.process.kill)
-                return one
+                relay = Relay(socket_path, tmp_path / name if name else None, *more)
+                stack.callback(relay.process.communicate)
+                stack.callback(relay.process.kill)
+                return relay
 
         yield Stage

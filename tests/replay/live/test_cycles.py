@@ -74,8 +74,8 @@ def measured_in_batches(path, length_ns):
             if m.log_time >= end_ns:
                 found += meter.add(log.decode(batch), log.robot)
                 batch, end_ns = [], m.log_time + length_ns
-            one = LiveMessage(m.channel_id, m.sequence, m.log_time, m.publish_time, 0, m.data)
-            batch.append(one)
+            message = LiveMessage(m.channel_id, m.sequence, m.log_time, m.publish_time, 0, m.data)
+            batch.append(message)
     return [*found, *meter.add(log.decode(batch), log.robot)]
 
 
@@ -83,7 +83,7 @@ def measured_in_batches(path, length_ns):
 @pytest.mark.parametrize("length_ns", [30_000_000, 700_000_000, 7_000_000_000, 20_000_000_000])
 def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
     with Session.open(walk) as session:
-        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+        joints = {joint.name: joint for joint in analyse_session(session).over_time.joints}
         start_ns = session.start_ns
     found = measured_in_batches(walk, length_ns)
     assert len({cycle.start_ns for cycle in found}) == len(found)  # each once
@@ -94,8 +94,8 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
                 given[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
     expected = {
         (name, round(start_s * 1e3)): (gain, lag)
-        for name, one in joints.items()
-        for start_s, gain, lag in zip(one.start_s, one.gain, one.lag_rad, strict=True)
+        for name, joint in joints.items()
+        for start_s, gain, lag in zip(joint.start_s, joint.gain, joint.lag_rad, strict=True)
         if gain is not None
     }
     assert len(expected) == 13 * 4  # two whole cycles and their surroundings in either run
@@ -162,7 +162,7 @@ def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_ba
         relay.process.wait()
     assert report["dropped"] == report["unread"] == 0
     drawn = read_back(tmp_path / "live.rrd")
-    joints = {one.name: one for one in analyse_session(opened(session_file)).over_time.joints}
+    joints = {joint.name: joint for joint in analyse_session(opened(session_file)).over_time.joints}
     names = drawn.static("/cycles/lag_degrees", "SeriesLines:names")
     rows = drawn.column("/cycles/lag_degrees", "Scalars:scalars")
     assert len(rows) >= 2

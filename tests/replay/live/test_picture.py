@@ -87,7 +87,7 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     for entity in ("/joints/measured", "/joints/commanded", "/power/total/mechanical"):
         for component in ("SeriesLines:names", "SeriesLines:colors"):
             assert drawn.static(entity, component) == replay.static(entity, component)
-    static = [one for one in drawn._chunks if one.entity_path == "/joints/measured"]
+    static = [chunk for chunk in drawn._chunks if chunk.entity_path == "/joints/measured"]
     assert sum(one.is_static for one in static) == 1
 
 

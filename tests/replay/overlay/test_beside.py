@@ -262,7 +262,9 @@ def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlai
         return height
 
     comparison = compare_sessions(*map(opened, files), Choices(any_gait=True))
-    noted = {(one.quantity, one.place): one for one in comparison.differences}
+    noted = {
+        (difference.quantity, difference.place): difference for difference in comparison.differences
+    }
     for joint in NAMES:
         gain = bar("/compared/b/segments/gain/estimate", joint)
         lag = bar("/compared/b/segments/lag/estimate", joint)
@@ -315,9 +317,9 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
         report = report_of("view", *pair, "--save", tmp_path / "x.rrd", "--force")
         bodies = {one["name"]: one["body"] for one in report["sessions"]}
         assert bodies == {"a": True, "bare": False}
-        found = read_back(tmp_path / "x.rrd")
-        assert degrees(found, f"/compared/{pair[1].stem}/angles").shape[1] == len(NAMES)
-        assert not [e for e in found.entities if e.startswith("/bare/world")]
+        back = read_back(tmp_path / "x.rrd")
+        assert degrees(back, f"/compared/{pair[1].stem}/angles").shape[1] == len(NAMES)
+        assert not [e for e in back.entities if e.startswith("/bare/world")]
 
 
 def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, overlaid):

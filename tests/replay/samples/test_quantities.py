@@ -157,8 +157,8 @@ def opened(tmp_path):
         return sessions[-1]
 
     yield write
-    for one in sessions:
-        one.close()
+    for session in sessions:
+        session.close()
 
 
 def test_the_fields_that_come_are_found(opened):
@@ -247,10 +247,12 @@ def test_stretches_are_as_long_as_they_have_to_be(opened):
     session = opened(("/joint_states", ("a",), t, t))
     assert stretch_length_ns(session) == STRETCH_NS
     assert stretch_length_ns(session, 3 * STRETCH_NS) == 3 * STRETCH_NS
-    spans = [one.span for one in timeline.stretches(session, {"/joint_states": ["position"]}, NS)]
+    spans = [
+        stretch.span for stretch in timeline.stretches(session, {"/joint_states": ["position"]}, NS)
+    ]
     starts = [session.start_ns + k * STRETCH_NS for k in range(1, 5)]
-    assert [one.start_ns for one in spans[1:]] == starts == [one.stop_ns for one in spans[:-1]]
-    assert [one.known_ns for one in spans] == [*(at + NS for at in starts), None]
+    assert [span.start_ns for span in spans[1:]] == starts == [span.stop_ns for span in spans[:-1]]
+    assert [span.known_ns for span in spans] == [*(at + NS for at in starts), None]
     read = timeline.stretches(session, {"/joint_states": ["position"]}, NS)
     for k, one in enumerate(read):
         (line,) = one.columns["/joint_states", "position"]
@@ -272,8 +274,8 @@ def test_stretches_are_as_long_as_they_have_to_be(opened):
 def test_a_session_without_samples_of_a_field_gives_the_others(opened):
     t = np.arange(30) / 10
     session = opened(("/joint_states", ("a", "b"), t, t), ("/empty", ("a",), t, t * np.nan))
-    found = read_columns(session)
-    assert set(found) == {("/joint_states", "position")}
+    columns = read_columns(session)
+    assert set(columns) == {("/joint_states", "position")}
     window = read_columns(
         session, start_ns=session.start_ns + NS, stop_ns=session.start_ns + 2 * NS
     )

@@ -101,7 +101,7 @@ def test_every_sample_is_in_one_stretch(session_file, monkeypatch):
         pieces = []
         for part in parts:
             tracks = part.columns["/joint_states", "position"]
-            (track,) = [one for one in tracks if one.name == name]
+            (track,) = [track for track in tracks if track.name == name]
             pieces.append(track.t_ns[part.span.rows(track.t_ns)])
         np.testing.assert_array_equal(np.concatenate(pieces), whole[i])
 
@@ -114,7 +114,9 @@ def test_a_span_is_half_open():
 def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25, opened):
     found = survey(opened(session_file), 50.0)
     assert found.parts["/joints/measured"] == (snake25.joint_names,)  # in turn: drawn together
-    assert [one.name for one in found.samples["/joints/measured"]] == list(snake25.joint_names)
+    assert [sample.name for sample in found.samples["/joints/measured"]] == list(
+        snake25.joint_names
+    )
     assert found.wanted["/joint_states"] == ["position", "velocity", "effort"]
     assert "/gait" not in found.wanted
     assert found.context_ns == pytest.approx(6 * 100_000_000, rel=0.01)  # ten times a second

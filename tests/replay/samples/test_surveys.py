@@ -75,7 +75,7 @@ def test_a_brief_survey_is_as_thin_as_what_it_reads(session, monkeypatch):
     # All of it is thinned to as many of each stretch.
     whole = lines(survey(long, 50.0))["a"][0]
     stretches = [t[(t >= 40 * k) & (t < 40 * (k + 1) if k < 7 else t >= 280)] for k in range(8)]
-    np.testing.assert_allclose(whole, np.concatenate([one[::67] for one in stretches]))
+    np.testing.assert_allclose(whole, np.concatenate([stretch[::67] for stretch in stretches]))
 
 
 @pytest.mark.parametrize(("count", "apart"), [(39, 1), (40, 2), (79, 2), (80, 3), (120, 4)])

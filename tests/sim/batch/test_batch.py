@@ -123,7 +123,9 @@ def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
     (run,) = run_batch([scenario])
     samples = on_mujoco(scenario)
     body = [sample.step.body for sample in samples]
-    assert run.command == pytest.approx(np.array([one.gait.command for one in samples]), abs=1e-15)
+    assert run.command == pytest.approx(
+        np.array([sample.gait.command for sample in samples]), abs=1e-15
+    )
     assert run.angle == pytest.approx(np.array([one.angle for one in body]), abs=1e-11)
     assert run.rate == pytest.approx(np.array([one.rate for one in body]), abs=1e-9)
     assert run.head == pytest.approx(np.array([one.position[:, 0] for one in body]), abs=1e-11)
@@ -134,7 +136,7 @@ def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
     mass = np.array([link.mass for link in scenario.robot.links])
     centre = np.array([one.position @ mass / mass.sum() for one in body])
     assert run.centre_of_mass == pytest.approx(centre, abs=1e-11)
-    work = np.array([one.joint_energy[[0, 2, 3, 4]] for one in samples]).swapaxes(0, 1)
+    work = np.array([sample.joint_energy[[0, 2, 3, 4]] for sample in samples]).swapaxes(0, 1)
     assert run.work == pytest.approx(work, abs=1e-9)
     polled = [joint for sample in samples for joint in sample.sensed]  # means around each tick
     for name in ("effort", "current", "voltage"):
@@ -232,8 +234,8 @@ def test_a_free_planar_chain_keeps_its_momenta_and_its_energy_is_the_joints_work
 def test_a_run_that_fails_ends_alone_with_its_time_and_place(weak, make_scenario):
     robot = weak.robot
     stiff = [
-        dataclasses.replace(one, servo=dataclasses.replace(one.servo, gear_stiffness=4e4))
-        for one in robot.joints
+        dataclasses.replace(joint, servo=dataclasses.replace(joint.servo, gear_stiffness=4e4))
+        for joint in robot.joints
     ]
     broken = dataclasses.replace(weak, robot=dataclasses.replace(robot, joints=tuple(stiff)))
     flying = dataclasses.replace(

@@ -110,7 +110,9 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, co
         assert [message.data for _, message in over_bus.messages("/gate/phase")] == ["run"]
     # The robot did what the twin does with commands rounded to the bus, and reported it, rounded.
     samples = sensed(weak(0.3), Rounded(build_gait(weak(0.3))))
-    cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])[:-2]
+    cycles = np.array([sample.position for sample in samples if isinstance(sample, JointSample)])[
+        :-2
+    ]
     found = np.array(measured.values)
     assert not found[:, 0].any()  # how it stood before the first command
     found = found[:, 1 : 1 + len(cycles)]

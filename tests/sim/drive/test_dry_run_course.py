@@ -51,11 +51,11 @@ def motion(pose=(0.0, 0.0, 0.0), *, robot=ROBOT, world=None, duration_s=0.05):
         return made[-1][2]
 
     facts, texts = {"driven": "plan"}, {"plan.toml": b"# bent"}
-    found = MotionSource(
+    source = MotionSource(
         "plan", "bent", robot, lambda: world, duration_s, (), make, facts, texts,
         records={"undulog.plan": {"run": "0"}},
     )  # fmt: skip
-    return found, made
+    return source, made
 
 
 def ramp_s(way):
@@ -208,7 +208,7 @@ def test_a_first_pose_beyond_a_limit_is_approached_to_the_limit():
         return dry_run(driven, stop=stop, on_time=on_time)
 
     assert begun(driven).approach_s == pytest.approx(ramp_s(UPPER))
-    joints = tuple(dataclasses.replace(one, lower=0.1, upper=0.4) for one in ROBOT.joints)
+    joints = tuple(dataclasses.replace(joint, lower=0.1, upper=0.4) for joint in ROBOT.joints)
     bent = dataclasses.replace(ROBOT, joints=joints)  # straight is beyond a limit
     driven, _ = motion((0.3, 0.2, 0.1), robot=bent, duration_s=0.01)
     assert begun(driven).approach_s == pytest.approx(ramp_s(0.2))

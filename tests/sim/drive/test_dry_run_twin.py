@@ -77,7 +77,10 @@ def test_it_would_run_and_the_first_line_says_so(waved):
     assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
     joint, demand = run.closest
     assert demand.share == max(
-        one.share for each in run.joints for one in each.demands if math.isfinite(one.share)
+        demand.share
+        for joint in run.joints
+        for demand in joint.demands
+        if math.isfinite(demand.share)
     )
     assert f"{joint}, {demand.name}" in lines[0]
     assert f"({demand.share:.0%})" in lines[0]
@@ -88,7 +91,7 @@ def test_the_table_is_aligned_and_narrow_terminals_go_without_columns(waved, wid
     _, run, _ = waved
     lines = list(summary_lines(run, width))
     head = next(k for k, line in enumerate(lines) if line.startswith("joint "))
-    assert [line.split()[0] for line in lines[head + 1 :]] == [one.name for one in run.joints]
+    assert [line.split()[0] for line in lines[head + 1 :]] == [joint.name for joint in run.joints]
     assert len({len(line) for line in lines[head:]}) == 1  # numbers end at one column
     assert len(lines[head]) <= width
     assert len([k for k, title in enumerate(lines[head].split()) if title == "%"]) == 5  # they stay

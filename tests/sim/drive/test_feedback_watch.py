@@ -240,7 +240,7 @@ def test_frames_that_are_no_data_of_others_are_not_counted():
 @pytest.mark.parametrize("others", [(0x119,), (0x108, 0x102), (MARK, 0x201, 0x101)])
 def test_commands_of_another_controller_are_a_fault(others):
     fault = BusCheck(ROBOT).add(frames_of(*others))
-    first = next(one for one in others if 0x101 <= one <= 0x119)
+    first = next(other for other in others if 0x101 <= other <= 0x119)
     assert fault.kind is FaultKind.STRANGER
     assert fault.text == (
         f"another controller commands snake25 on this bus: frame {first:03X} was received; end "

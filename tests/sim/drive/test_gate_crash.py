@@ -23,7 +23,9 @@ pytestmark = pytest.mark.slow
 
 def check_kept(written, lines):
     """All that was on the bus is there, but for the tick in which the process died."""
-    on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
+    on_bus = [
+        (line["id"], line["data"]) for line in lines if (line["name"] or "").endswith("_command")
+    ]
     assert written.sent == on_bus[: len(written.sent)]
     assert len(on_bus) - len(written.sent) in {0, len(JOINTS)}
     for name, (_, angle) in gate_stage.commands_of(lines).items():
@@ -79,8 +81,8 @@ def fill(folder):
 
 def check_missing(err, size):
     """The bytes that are needed are those that are free, and those that are missing."""
-    found = re.search(rf"needs {size} bytes and the disk has (\d+) free: (\d+) bytes are mi", err)
-    assert int(found[1]) + int(found[2]) == size
+    match = re.search(rf"needs {size} bytes and the disk has (\d+) free: (\d+) bytes are mi", err)
+    assert int(match[1]) + int(match[2]) == size
 
 
 def check_told(err, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):

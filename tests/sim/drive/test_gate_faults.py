@@ -208,7 +208,7 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(dri
     assert "no command was sent: another robot is on this bus" in err
     assert "0 are of snake4; others have the identifiers 601" in err
     # Nobody else spoke:
-    assert {one["id"] for one in lines} == {1537, 1538, 1539, 1540, gate_stage.MARK}
+    assert {line["id"] for line in lines} == {1537, 1538, 1539, 1540, gate_stage.MARK}
 
 
 # -- who is in charge goes ----------------------------------------------------------------------

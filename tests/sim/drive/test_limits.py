@@ -49,7 +49,7 @@ def status(*angle):
 
 
 def with_safety(safety, quantities=("position", "command", "velocity")):
-    signals = [one for one in ROBOT.bus.signals if one.quantity in quantities]
+    signals = [signal for signal in ROBOT.bus.signals if signal.quantity in quantities]
     bus = dataclasses.replace(ROBOT.bus, signals=tuple(signals))
     return dataclasses.replace(ROBOT, safety=safety, bus=bus)
 
@@ -70,8 +70,8 @@ def test_limits_of_what_the_bus_tells_are_needed_and_others_are_not():
     few = {key: value for key, value in given.items() if key != "max_rate"}
     assert missing_limits(with_safety(Safety(**few, of=of))) == ("max_rate",)
     commanded = [
-        dataclasses.replace(one, quantity="voltage") if one.direction == "tx" else one
-        for one in ROBOT.bus.signals
+        dataclasses.replace(signal, quantity="voltage") if signal.direction == "tx" else signal
+        for signal in ROBOT.bus.signals
     ]
     told = dataclasses.replace(ROBOT.bus, signals=tuple(commanded))
     assert "min_voltage" not in missing_limits(dataclasses.replace(ROBOT, bus=told))

@@ -183,9 +183,9 @@ def test_ticks_that_came_before_go_on_counting_their_own_frames(monkeypatch):
     for expected in (1, 2, 3):
         tick, arrays = link.wait_tick(0.0)
         assert tick == expected
-        numbers.append([hex(int(one)) for frames in arrays for one in frames["id_flags"]])
+        numbers.append([hex(int(frame)) for frames in arrays for frame in frames["id_flags"]])
     assert numbers == [["0x201", "0x202"], ["0x203"], []]
-    assert [int(one) for frames in link.receive() for one in frames["id_flags"]] == [
+    assert [int(frame) for frames in link.receive() for frame in frames["id_flags"]] == [
         0x204, 0x205, 0x206,
     ]  # fmt: skip
 
@@ -214,7 +214,7 @@ def test_the_age_of_each_value_is_its_own():
 
 def test_beyond_its_greatest_range_a_sensor_sees_nothing():
     robot = load_robot("snake25")
-    (sensor,) = (one for one in robot.sensors if one.name == "ir01")
+    (sensor,) = (sensor for sensor in robot.sensors if sensor.name == "ir01")
     farther = dataclasses.replace(sensor, range_max=0.5)
     endless = dataclasses.replace(sensor, range_max=None)
     encode = BusEncoder(robot, Direction.RX).encode

@@ -121,12 +121,12 @@ def drive(
         if on_tick is not None:
             on_tick(tick)
 
-    found = SimpleNamespace(loop=loop, gate=gate, servo=servo, ticks=ticks, begun_ns=begun_ns)
+    namespace = SimpleNamespace(loop=loop, gate=gate, servo=servo, ticks=ticks, begun_ns=begun_ns)
     try:
         loop.run(stop or StopRequest(), each, **more)
     except (SourceError, LogWriteError) as error:  # the tests look at both
-        found.error = error
-    return found
+        namespace.error = error
+    return namespace
 
 
 def test_it_asks_in_each_tick_and_commands_before_it_asks():
@@ -149,8 +149,8 @@ def test_it_asks_in_each_tick_and_commands_before_it_asks():
         assert earliest[1] == 0  # requests wait for nothing
     assert [len(tick.sent) for tick in run.ticks] == [1] * 50 + [2] * 51
     stamps = [tick.sent["t_host_ns"].tolist() for tick in run.ticks]
-    assert all(set(one) == {one[0]} for one in stamps)
-    assert np.all(np.diff([one[0] for one in stamps]) > 0)
+    assert all(set(stamp) == {stamp[0]} for stamp in stamps)
+    assert np.all(np.diff([stamp[0] for stamp in stamps]) > 0)
     assert [tick.tick for tick in run.ticks] == list(range(101))
     assert run.ticks[7].time_s == 0.07
     assert not run.ticks[0].received

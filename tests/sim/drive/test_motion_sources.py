@@ -56,18 +56,23 @@ def test_a_session_gives_its_commands_and_what_explains_them(tmp_path):
     plan = {"plan": "kicks", "run": "3", "heading_rad": "0.25"}
     facts = {"settle_s": "0.02", "kernels": "numba", "driven": "gait"}
     word = written(tmp_path / "a.mcap", texts=TEXTS, plan=plan, gait=("A", "b"), **facts)
-    found = find_motion(word)
-    assert (found.kind, found.name, found.robot, found.own) == ("commands", "a.mcap", ROBOT, None)
-    assert (found.duration_s, found.planes, found.settle_s) == (0.05, (), 0.02)
-    assert found.facts == {
+    motion = find_motion(word)
+    assert (motion.kind, motion.name, motion.robot, motion.own) == (
+        "commands",
+        "a.mcap",
+        ROBOT,
+        None,
+    )
+    assert (motion.duration_s, motion.planes, motion.settle_s) == (0.05, (), 0.02)
+    assert motion.facts == {
         "driven": "commands", "driven.by": "a.mcap", "driven.session_id": "s7",
     }  # fmt: skip
-    assert found.attachments == {"plan.toml": b"# plan", "gait.toml": b"# gait"}
-    assert found.records == {"undulog.plan": plan}
-    assert (found.kernels, found.joints) == (Kernels.NUMBA, ROBOT.joint_names)
-    assert (found.heading_rad, found.run, found.as_run) == (0.25, 3, True)
-    assert found.world() is None
-    gait = found.make(ROBOT, None)
+    assert motion.attachments == {"plan.toml": b"# plan", "gait.toml": b"# gait"}
+    assert motion.records == {"undulog.plan": plan}
+    assert (motion.kernels, motion.joints) == (Kernels.NUMBA, ROBOT.joint_names)
+    assert (motion.heading_rad, motion.run, motion.as_run) == (0.25, 3, True)
+    assert motion.world() is None
+    gait = motion.make(ROBOT, None)
     assert type(gait) is CommandReplay
     tick = gait.step(0.03, sim.Readings.nothing(ROBOT))
     np.testing.assert_allclose(tick.command, 0.13)
@@ -75,10 +80,10 @@ def test_a_session_gives_its_commands_and_what_explains_them(tmp_path):
 
 
 def test_of_a_session_that_says_little_nothing_is_made_up(tmp_path):
-    found = find_motion(written(tmp_path / "a.mcap", plan={"plan": "kicks", "run": "3"}))
-    assert (found.attachments, found.settle_s, found.kernels) == ({}, None, Kernels.NUMPY)
+    motion = find_motion(written(tmp_path / "a.mcap", plan={"plan": "kicks", "run": "3"}))
+    assert (motion.attachments, motion.settle_s, motion.kernels) == ({}, None, Kernels.NUMPY)
     # Without a heading the runs of a plan differ by their commands.
-    assert (found.heading_rad, found.run, found.as_run) == (0.0, 0, False)
+    assert (motion.heading_rad, motion.run, motion.as_run) == (0.0, 0, False)
     bare = find_motion(written(tmp_path / "b.mcap"))
     assert (bare.records, bare.run) == ({}, 0)
     tick = bare.make(ROBOT, None).step(0.0, sim.Readings.nothing(ROBOT))
@@ -130,10 +135,10 @@ def test_the_world_of_a_run_is_the_one_that_it_had_changed_as_asked(tmp_path):
     ran = dataclasses.replace(nominal_world(ROBOT), seed=5)
     texts = {"scenario.toml": ran.toml().encode()}
     word = written(tmp_path / "a.mcap", texts=texts)
-    found = find_motion(word)
-    world = found.world()
+    motion = find_motion(word)
+    world = motion.world()
     assert (world.robot, world.seed, world.world) == (ROBOT, 5, ran.world)
-    assert found.attachments == {}
+    assert motion.attachments == {}
     sloping = find_motion(word, changes={"world.slope": 0.1, "seed": 8}).world()
     assert (sloping.seed, sloping.world.gravity[0]) == (8, pytest.approx(9.81 * math.sin(0.1)))
 
@@ -145,8 +150,8 @@ def test_parts_in_a_folder_are_a_session_and_damage_is_told(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     assert find_motion("flat").kind == "gait"
     shutil.copytree(folder, tmp_path / "night")
-    found = find_motion("night")
-    assert (found.kind, found.name, found.duration_s) == ("commands", "night", 0.05)
+    motion = find_motion("night")
+    assert (motion.kind, motion.name, motion.duration_s) == ("commands", "night", 0.05)
     assert capsys.readouterr().err == ""
     whole = (folder / "flat_0.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -163,8 +168,8 @@ def test_commands_may_have_another_topic_which_has_to_be_named(tmp_path):
         writer.set_verdict("good")
     with pytest.raises(MissingChannelError, match="choose with --command-topic"):
         find_motion(str(path))
-    found = find_motion(str(path), command_topic="/wishes")
-    tick = found.make(ROBOT, None).step(0.0, sim.Readings.nothing(ROBOT))
+    motion = find_motion(str(path), command_topic="/wishes")
+    tick = motion.make(ROBOT, None).step(0.0, sim.Readings.nothing(ROBOT))
     assert tick.command.tolist() == [0.25] * 3
 
 
@@ -213,11 +218,11 @@ def test_a_scenarios_gait_is_that_of_the_world_it_is_driven_in():
                 made.step(time_s, nothing).command, expected.step(time_s, nothing).command
             )
     short = found.make(ROBOT, None)  # without a world: its own, of that robot
-    own = build_gait(dataclasses.replace(flat, robot=ROBOT))
+    gait = build_gait(dataclasses.replace(flat, robot=ROBOT))
     nothing = sim.Readings.nothing(ROBOT)
     for time_s in (0.0, 0.3):
         np.testing.assert_array_equal(
-            short.step(time_s, nothing).command, own.step(time_s, nothing).command
+            short.step(time_s, nothing).command, gait.step(time_s, nothing).command
         )
 
 

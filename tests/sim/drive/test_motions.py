@@ -19,7 +19,7 @@ from undulog.sim.drive.motion import (
 from undulog.sim.scenario.scenario import Kernels
 
 ROBOT = parse_robot(chain(3), "chain.toml", {})
-LEVEL = tuple(dataclasses.replace(one, plane=Plane.HORIZONTAL) for one in ROBOT.joints)
+LEVEL = tuple(dataclasses.replace(joint, plane=Plane.HORIZONTAL) for joint in ROBOT.joints)
 LEVEL = dataclasses.replace(ROBOT, name="level", joints=LEVEL)
 
 

@@ -104,9 +104,10 @@ def test_a_drive_of_no_length_or_too_long_is_refused(seconds):
 def test_joints_that_the_bus_map_lacks_are_named():
     def lacking(direction, quantity, *names):
         signals = tuple(
-            one
-            for one in ROBOT.bus.signals
-            if (one.direction, one.quantity) != (direction, quantity) or one.target not in names
+            signal
+            for signal in ROBOT.bus.signals
+            if (signal.direction, signal.quantity) != (direction, quantity)
+            or signal.target not in names
         )
         return dataclasses.replace(ROBOT, bus=dataclasses.replace(ROBOT.bus, signals=signals))
 

@@ -59,7 +59,7 @@ def test_each_joints_values_are_those_of_the_formulas(seed, make_scenario, make_
         segments.append(Segment(length_s, planes, transition_s, f"part{number}"))
     ramp_s = chance.choice([0.0, 0.4])
     plan = Plan("p", "d", make_scenario(), start, ramp_s, tuple(segments))
-    assert plan.duration_s == pytest.approx(sum(one.duration_s for one in segments))
+    assert plan.duration_s == pytest.approx(sum(segment.duration_s for segment in segments))
     gait = PlanGait(plan, robot, per_joint=True)
     factors, offsets = (
         np.array([chance.uniform(*span) for _ in robot.joints]) for span in ((0.5, 1), (0, 0.05))
@@ -132,7 +132,7 @@ def test_all_segments_together_are_a_day_at_most():
 
 def test_a_change_takes_a_second_but_no_longer_than_its_segment():
     plan = parse_plan(HEAD + parts(0.5, 1.0, 3.0), Path("p.toml"))
-    assert [one.transition_s for one in plan.segments] == [0.5, 1.0, 1.0]
+    assert [segment.transition_s for segment in plan.segments] == [0.5, 1.0, 1.0]
     plan = parse_plan(HEAD + parts(3.0, more="transition_s = 3.0\n"), Path("p.toml"))
     assert plan.segments[0].transition_s == 3.0
     assert list(faults(HEAD + parts(3.0, more="transition_s = 3.01\n"))) == [
@@ -169,15 +169,15 @@ def test_a_plane_comes_in_only_where_it_was_driven_from_the_start():
     head, rest = HEAD + "[gait]\nramp_s = 0.5\n", parts(1.0, 1.0, more=two)
     level = "[gait.{}]\namplitude = 0.2\nfrequency_hz = 0.5\nlag = 0.5\n"
     both = level.format("horizontal") + level.format("vertical")
-    found = parse_plan(head + both + rest, Path("p.toml"))
-    for segment in found.segments:
-        assert [(one.amplitude, one.lag) for one in segment.planes.values()] == [
+    plan = parse_plan(head + both + rest, Path("p.toml"))
+    for segment in plan.segments:
+        assert [(plane.amplitude, plane.lag) for plane in segment.planes.values()] == [
             (0.2, 0.7), (0.1, 0.5),
         ]  # fmt: skip
-    assert found.ramp_s == 0.5
+    assert plan.ramp_s == 0.5
     one = parts(1.0, more="vertical = { amplitude = 0.1 }\n")
     (segment,) = parse_plan(head + both + one, Path("p.toml")).segments
-    assert [one.amplitude for one in segment.planes.values()] == [0.2, 0.1]
+    assert [plane.amplitude for plane in segment.planes.values()] == [0.2, 0.1]
     wrong = rest.replace("amplitude = 0.1", "amplitude = -0.1")
     assert list(faults(head + level.format("vertical") + wrong))[:2] == [
         "segments[0].horizontal", "segments[0].vertical.amplitude",

@@ -69,31 +69,31 @@ def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():
 @pytest.mark.clock(0.02, "a servo in a thread has to answer within a control tick")
 def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     angles = 0.5 + 0.2 * np.sin(np.arange(121).clip(max=40) / 10)  # then it catches up
-    one = Servo(math.degrees(0.3))
-    with speaking("polled", one.answer):
+    servo = Servo(math.degrees(0.3))
+    with speaking("polled", servo.answer):
         report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
-    requests = [data for data in one.received if data[0] == 0x92]
-    commands = [data for data in one.received if data[0] == 0xA4]
-    assert len(requests) + len(commands) == report.tally.sent == len(one.received)
-    assert one.received[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
+    requests = [data for data in servo.received if data[0] == 0x92]
+    commands = [data for data in servo.received if data[0] == 0xA4]
+    assert len(requests) + len(commands) == report.tally.sent == len(servo.received)
+    assert servo.received[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
     given = np.radians([struct.unpack("<i", data[4:])[0] / 100 for data in commands])
     assert given[0] == pytest.approx(0.3, abs=0.011)
     assert np.abs(np.diff(given)).max() <= 4.0 * 0.01 + 2e-4
     assert given[-1] == pytest.approx(angles[-1], abs=1e-4)
     with Session.open(tmp_path / "a.mcap") as session:
         frames = session.frames("/can/polled")
-        assert (frames["dir"] == DIR_TX).sum() == len(one.received)
+        assert (frames["dir"] == DIR_TX).sum() == len(servo.received)
         assert (frames["dir"] == DIR_RX).sum() > 0
         assert np.nanmax(np.abs(session.joints("/joint_states").values[0] - 0.3)) < 0.5
 
 
 @pytest.mark.clock(0.02, "a servo in a thread has to answer within a control tick")
 def test_its_temperature_ends_the_drive(tmp_path, robot):
-    one = Servo(math.degrees(0.5))
-    one.temperature = 61
-    with speaking("polled-hot", one.answer):
+    servo = Servo(math.degrees(0.5))
+    servo.temperature = 61
+    with speaking("polled-hot", servo.answer):
         plan = planned(tmp_path, robot, "polled-hot", np.full(200, 0.5))
         report = drive_bus(plan, stop=StopRequest())
     assert report.outcome.why.startswith("joint01: temperature 61 degC, more than 60 degC for 0.3")
-    assert abs(one.degrees) <= 0.005
+    assert abs(servo.degrees) <= 0.005

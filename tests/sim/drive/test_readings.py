@@ -77,11 +77,11 @@ def test_nothing_in_range_is_infinitely_far_and_unknown_is_not_a_value(known):
 
 
 def test_what_has_not_come_for_long_is_unknown_again():
-    known = BusReadings(ROBOT, oldest_s=0.3)
-    known.add(encode(joint(Quantity.POSITION, 0.1) | {("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
-    known.add(encode(joint(Quantity.POSITION, 0.3, "joint04")), 0.2)
-    assert not math.isnan(known.readings(0.3).angle[2])
-    later = known.readings(0.31)
+    readings = BusReadings(ROBOT, oldest_s=0.3)
+    readings.add(encode(joint(Quantity.POSITION, 0.1) | {("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
+    readings.add(encode(joint(Quantity.POSITION, 0.3, "joint04")), 0.2)
+    assert not math.isnan(readings.readings(0.3).angle[2])
+    later = readings.readings(0.31)
     assert math.isnan(later.angle[2])
     assert (later.angle[3], later.ranges) == (pytest.approx(0.3, abs=1e-4), {})
 
@@ -120,13 +120,13 @@ SIG_VALTYPE_ 5 radians : 1;
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_a_servo_at_infinity_has_not_replied(value):
     """A bus with floating-point numbers can have it."""
-    known = BusReadings(bus_robot(FLOATS, [("angle", "radians", "rx", "position", "rad", "")]))
+    readings = BusReadings(bus_robot(FLOATS, [("angle", "radians", "rx", "position", "rad", "")]))
     frames = empty_frames(1)
     frames["id_flags"], frames["dlc"] = 5, 4
     for angle, time_s in ((0.25, 1.0), (value, 1.1)):
         frames["data"][0, :4] = np.frombuffer(np.float32(angle).tobytes(), np.uint8)
-        known.add(frames, time_s)
-    status = known.status(1.1)
+        readings.add(frames, time_s)
+    status = readings.status(1.1)
     assert status.angle.tolist() == [0.25]
     assert status.silence_s[0] == pytest.approx(0.1)
-    assert known.angles.tolist() == [1]
+    assert readings.angles.tolist() == [1]

@@ -67,7 +67,7 @@ def test_modes_and_values_are_those_of_the_time_and_may_be_unknown():
 
 
 def test_joints_without_a_command_rest_and_all_are_within_their_limits():
-    joints = [dataclasses.replace(one, lower=0.05, upper=0.3) for one in ROBOT.joints]
+    joints = [dataclasses.replace(joint, lower=0.05, upper=0.3) for joint in ROBOT.joints]
     robot = dataclasses.replace(ROBOT, joints=tuple(joints))
     recorded = RecordedCommands(signals("/joint_commands", joint02={0: 0.9}, joint01={0: -0.9}))
     tick = CommandReplay(recorded, robot).step(0.0, NOTHING)

@@ -72,9 +72,9 @@ def test_a_full_disk_is_a_shortage_and_what_is_elsewhere_the_end(tmp_path, monke
     assert session.shortage is None
     state["misplaced"] = "the folder was moved"
     assert session.shortage == "the folder was moved"
-    found = LogWriteError("/proc/none/a.mcap", "no space left")
-    state["shortage"] = found
-    assert session.shortage == f"the disk at /proc is full or fails: {found}"
+    error = LogWriteError("/proc/none/a.mcap", "no space left")
+    state["shortage"] = error
+    assert session.shortage == f"the disk at /proc is full or fails: {error}"
     state["rescued"] = (Path("/b/1.mcap"), Path("/b/2.mcap"))
     with pytest.raises(LogWriteError) as moved:
         session.close()

@@ -147,8 +147,8 @@ def foreign_phases(start, forward, backward, detuning, *, times, drive=None):
                 out[i] += drive(t, i, x[i])
         return out
 
-    found = solve_ivp(rate, (0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
-    return found.y.T
+    ivp = solve_ivp(rate, (0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
+    return ivp.y.T
 
 
 def test_phases_against_scipy(make_robot):

@@ -165,6 +165,6 @@ def test_the_urdf_is_plain_xml_with_shapes(uneven):
 def test_two_bodies_live_side_by_side(make_scenario, make_robot):
     small = make_scenario(make_robot(4), duration_s=0.2, ramp_s=0.0)
     expected = [sample.step.body.angle for sample in simulate(small)]
-    with Twin(small) as one, Twin(make_scenario(make_robot(6), amplitude=0.0)) as other:
-        found = [a.step.body.angle for a, _ in zip(one.samples(), other.samples(), strict=False)]
+    with Twin(small) as twin, Twin(make_scenario(make_robot(6), amplitude=0.0)) as other:
+        found = [a.step.body.angle for a, _ in zip(twin.samples(), other.samples(), strict=False)]
     assert math.isclose(np.abs(np.array(found) - expected[: len(found)]).max(), 0.0)

@@ -183,8 +183,8 @@ def test_the_compass_has_its_rate_noise_and_steps(make_compass):
     kind = make_compass(model=CompassModel(resolution=0.0))
     samples = taken(kind, 5000, at_rest(0.3, 0.0, 0.0))
     assert len(samples) == 1000
-    np.testing.assert_allclose(np.diff([one.time_s for one in samples]), 0.05, atol=1e-12)
-    values = np.array([one.vector[:2] for one in samples])
+    np.testing.assert_allclose(np.diff([sample.time_s for sample in samples]), 0.05, atol=1e-12)
+    values = np.array([sample.vector[:2] for sample in samples])
     np.testing.assert_allclose(values.std(axis=0), 2e-7, rtol=0.1)
     kind = make_compass(model=CompassModel())
     steps = np.array([one.vector[:2] for one in taken(kind, 50, at_rest(0.3, 0.0, 0.0))]) / 1e-7

@@ -94,7 +94,7 @@ def test_joints_respond_as_the_linear_chain(make_robot, make_scenario, stall_tor
     frequency_hz, m = 1.0, 5
     robot = make_robot(m + 1, planar=True, stall_torque=stall_torque, coulomb_friction=0.0)
     # Heavier to turn than the default links, so that long steps are stable.
-    links = tuple(dataclasses.replace(one, inertia=(2e-4, 2e-4, 2e-4)) for one in robot.links)
+    links = tuple(dataclasses.replace(link, inertia=(2e-4, 2e-4, 2e-4)) for link in robot.links)
     robot = dataclasses.replace(robot, links=links)
 
     def response(rate_hz):

@@ -169,7 +169,7 @@ def test_the_sonar_measures_the_nearest_thing_in_its_cone(robot):
     caster = RayCaster([Wall(*ends, 0.02, 3.0)], ground=True)
     samples = taken(Sonar(QUIET, [SONAR], robot, caster, dt=DT, seed=1), 100)
     assert len(samples) == 20
-    np.testing.assert_allclose(np.diff([one.time_s for one in samples]), 0.05, atol=1e-12)
+    np.testing.assert_allclose(np.diff([sample.time_s for sample in samples]), 0.05, atol=1e-12)
     assert samples[0].distance == pytest.approx(2.0, rel=2e-3)
     assert samples[0].distance >= 2.0
 

@@ -81,7 +81,7 @@ def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_pat
     path = tmp_path / "senses.mcap"
     sim.record(scenario, path)
     value = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
-    topics = {one.name: one.topic for one in scenario.robot.sensors}
+    topics = {sensor.name: sensor.topic for sensor in scenario.robot.sensors}
     with Session.open(path) as session:
         for name, topic in topics.items():
             mine = [(tick, one) for tick, one in value if getattr(one, "name", "") == name]

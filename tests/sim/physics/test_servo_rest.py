@@ -76,10 +76,10 @@ def test_servos_without_it_keep_their_smooth_friction_beside_one_that_has_it():
     both = Servos([Servo(), Servo(static_friction=0.05)])
     alone = Servos([Servo()])
     state = Rotors(np.array([0.01, 0.01]), np.array([0.3, 0.3]))
-    one = Rotors(state.angle[:1], state.speed[:1])
+    rotors = Rotors(state.angle[:1], state.speed[:1])
     drive = both.drive(np.full(2, 0.1), np.zeros(2), np.zeros(2), state)
-    single = alone.drive(np.full(1, 0.1), np.zeros(1), np.zeros(1), one)
-    after, expected = both.advance(state, drive, DT), alone.advance(one, single, DT)
+    single = alone.drive(np.full(1, 0.1), np.zeros(1), np.zeros(1), rotors)
+    after, expected = both.advance(state, drive, DT), alone.advance(rotors, single, DT)
     assert after.speed[0] == expected.speed[0]
     assert after.speed[1] != expected.speed[0]
 
@@ -118,8 +118,8 @@ def test_rotors_rest_at_every_reversal_and_the_ledger_closes_on_all_engines_and_
     angles = []
     for engine, kernels in itertools.product(EngineKind, Kernels):
         samples = simulate(dataclasses.replace(scenario, engine=engine), kernels=kernels)
-        angle = np.array([one.step.rotors.angle for one in samples])
-        still = np.array([one.step.rotors.speed == 0.0 for one in samples])
+        angle = np.array([sample.step.rotors.angle for sample in samples])
+        still = np.array([sample.step.rotors.speed == 0.0 for sample in samples])
         energy = energies(samples[-1])
         assert (np.count_nonzero(still[20:], axis=0) >= 4).all()
         between = still[1:] & still[:-1]

@@ -27,30 +27,34 @@ def outside(point, size):
 def test_circles(seed):
     random, middle, half = random_segments(seed, 200, 1.0)
     centre, radius = random.uniform(-1, 1, (2, 200)), random.uniform(0.1, 0.5, 200)
-    found = to_circles(middle, half, centre, radius)
+    circles = to_circles(middle, half, centre, radius)
     for i in range(200):
         points = middle[:, i, None] + PLACES * half[:, i, None]
         brute = np.hypot(*(points - centre[:, i, None])).min() - radius[i]
-        assert found.distance[i] == pytest.approx(brute, abs=1e-4)
-        assert found.distance[i] <= brute + 1e-12
-        touch = centre[:, i] + (radius[i] + found.distance[i]) * found.normal[:, i]
-        np.testing.assert_allclose(touch, middle[:, i] + found.s[i] * half[:, i], atol=1e-12)
+        assert circles.distance[i] == pytest.approx(brute, abs=1e-4)
+        assert circles.distance[i] <= brute + 1e-12
+        touch = centre[:, i] + (radius[i] + circles.distance[i]) * circles.normal[:, i]
+        np.testing.assert_allclose(touch, middle[:, i] + circles.s[i] * half[:, i], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rectangles_apart(seed):
     random, middle, half = random_segments(seed, 300, 1.0)
     size = random.uniform(0.1, 0.8, (2, 300))
-    found = to_rectangles(middle, half, size)
-    apart = found.distance > 0.0
+    rectangles = to_rectangles(middle, half, size)
+    apart = rectangles.distance > 0.0
     assert apart.sum() > 100
-    np.testing.assert_allclose(np.hypot(*found.normal), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.hypot(*rectangles.normal), 1.0, rtol=1e-12)
     for i in range(300):
         brute = outside(middle[:, i, None] + PLACES * half[:, i, None], size[:, i]).min()
-        assert max(found.distance[i], 0.0) == pytest.approx(brute, abs=1e-4)
+        assert max(rectangles.distance[i], 0.0) == pytest.approx(brute, abs=1e-4)
         if apart[i]:
             # The point on the rectangle that the normal leads back to is on its edge.
-            foot = middle[:, i] + found.s[i] * half[:, i] - found.distance[i] * found.normal[:, i]
+            foot = (
+                middle[:, i]
+                + rectangles.s[i] * half[:, i]
+                - rectangles.distance[i] * rectangles.normal[:, i]
+            )
             assert np.abs(np.abs(foot) - size[:, i]).min() < 1e-9
             assert (np.abs(foot) <= size[:, i] + 1e-9).all()
 
@@ -60,11 +64,11 @@ def test_rectangles_overlapped_part_by_the_shortest_way_out(seed):
     random, middle, half = random_segments(seed, 300, 0.8)
     middle *= 0.4
     size = random.uniform(0.2, 0.8, (2, 300))
-    found = to_rectangles(middle, half, size)
-    inside = np.flatnonzero(found.distance < -0.03)  # brute force misses what is shallower
+    rectangles = to_rectangles(middle, half, size)
+    inside = np.flatnonzero(rectangles.distance < -0.03)  # brute force misses what is shallower
     assert len(inside) > 100
     for i in inside:
-        depth, normal = -found.distance[i], found.normal[:, i]
+        depth, normal = -rectangles.distance[i], rectangles.normal[:, i]
 
         def apart(shift, i=i):
             points = (middle[:, i] + shift)[:, None] + PLACES[::20] * half[:, i, None]
@@ -87,13 +91,13 @@ def test_depth_and_normal_go_on_smoothly_from_a_touch():
         touch = to_rectangles(np.array([middle]).T, np.array([half]).T, size).distance[0]
         start = np.array(middle) - touch * np.array(normal)
         for k in (-2, -1, 1, 2):
-            found = to_rectangles((start + k * step)[:, None], np.array([half]).T, size)
-            assert found.distance[0] == pytest.approx(-k * 1e-6, abs=1e-9)
-            np.testing.assert_allclose(found.normal[:, 0], normal, atol=1e-6)
+            rectangles = to_rectangles((start + k * step)[:, None], np.array([half]).T, size)
+            assert rectangles.distance[0] == pytest.approx(-k * 1e-6, abs=1e-9)
+            np.testing.assert_allclose(rectangles.normal[:, 0], normal, atol=1e-6)
 
 
 def test_a_segment_that_is_a_point_in_plan_view():
     size = np.array([[0.5, 0.5], [0.3, 0.3]])
-    found = to_rectangles(np.array([[0.8, 0.45], [0.0, 0.1]]), np.zeros((2, 2)), size)
-    np.testing.assert_allclose(found.distance, [0.3, -0.05])
-    np.testing.assert_allclose(found.normal, [[1, 1], [0, 0]])
+    rectangles = to_rectangles(np.array([[0.8, 0.45], [0.0, 0.1]]), np.zeros((2, 2)), size)
+    np.testing.assert_allclose(rectangles.distance, [0.3, -0.05])
+    np.testing.assert_allclose(rectangles.normal, [[1, 1], [0, 0]])

@@ -70,9 +70,9 @@ def test_every_key_is_read_and_written_back():
     assert scenario.gait.planes[Plane.HORIZONTAL].signed_lag == 0.5
     assert scenario.world.ground.law is FrictionLaw.BOX
     joints, links = scenario.robot.joints, scenario.robot.links
-    assert [one.servo.stall_torque for one in joints] == [0.25, 0.25, 0.2, *[0.25] * 9]
+    assert [joint.servo.stall_torque for joint in joints] == [0.25, 0.25, 0.2, *[0.25] * 9]
     assert joints[2].servo.coulomb_friction == 0.0
-    assert [one.mass for one in links] == pytest.approx([0.1] * 3 + [0.15] + [0.1] * 9, rel=1e-15)
+    assert [link.mass for link in links] == pytest.approx([0.1] * 3 + [0.15] + [0.1] * 9, rel=1e-15)
     assert links[3].inertia == pytest.approx((6e-5, 7.5e-5, 7.5e-5), rel=1e-15)
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
 
@@ -202,5 +202,5 @@ def test_the_session_id_changes_with_whatever_changes_the_run():
         dataclasses.replace(scenario, robot=other_robot),
         parse_scenario(SNAKE13.replace("0.3", "0.31"), "x.toml"),
     ]
-    assert len({one.session_id for one in variants}) == len(variants)
+    assert len({variant.session_id for variant in variants}) == len(variants)
     assert parse_scenario(SNAKE13, "x.toml").session_id == scenario.session_id

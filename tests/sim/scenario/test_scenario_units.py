@@ -37,7 +37,7 @@ def test_every_number_has_a_unit_or_is_known_to_have_none(name, report_of):
 )
 def test_units_are_those_of_the_classes_descriptions(key, cls):
     stated = dict(re.findall(r"^\s+(\w+): [^\[\n]*\[([^\]]+)\]", cls.__doc__, re.MULTILINE))
-    names = [one.name for one in dataclasses.fields(cls) if one.name in stated]
+    names = [field.name for field in dataclasses.fields(cls) if field.name in stated]
     assert names
     assert {name: unit_of(f"{key}.{name}") for name in names} == {n: stated[n] for n in names}
 

@@ -147,9 +147,11 @@ def test_a_field_stands_clear_of_what_is_there_and_joins_it():
     box = "[[world.obstacles]]\nshape = 'box'\nposition = [2.0, 0.0]\nsize = [1.0, 1.0]\n"
     world = sim.parse_scenario(SNAKE13 + FIELD + box, "x.toml").world
     assert world.obstacles[0] == sim.Box((2.0, 0.0), (1.0, 1.0))
-    for one in world.obstacles[1:]:
-        x, y = (max(abs(c - m) - 0.5, 0.0) for c, m in zip(one.position, (2.0, 0.0), strict=True))
-        assert math.hypot(x, y) - one.radius >= 0.15 - 1e-12
+    for obstacle in world.obstacles[1:]:
+        x, y = (
+            max(abs(c - m) - 0.5, 0.0) for c, m in zip(obstacle.position, (2.0, 0.0), strict=True)
+        )
+        assert math.hypot(x, y) - obstacle.radius >= 0.15 - 1e-12
     redrawn = world.redrawn(5, 0.8)
     assert redrawn.obstacles[0] == world.obstacles[0]
     assert len(redrawn.obstacles) == len(world.obstacles) == 13

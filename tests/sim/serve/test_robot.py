@@ -122,7 +122,7 @@ def running():
 def positions(robot, frames, quantity=Quantity.POSITION):
     """What frames of one cycle tell, by default angles, in the order of the joints."""
     samples, _ = BusDecoder(robot).decode(frames)
-    (found,) = [one for one in samples if one.signals[0].quantity is quantity]
+    (found,) = [sample for sample in samples if sample.signals[0].quantity is quantity]
     order = [robot.joint_names.index(found.signals[k].target) for k in found.member]
     angles = np.full(JOINTS, np.nan)
     angles[order] = found.values
@@ -397,5 +397,5 @@ def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
     for tick in range(quiet.tick_count):
         live.command([0.3 * math.sin(0.1 * tick), 0.0, 0.3 * math.sin(0.1 * tick), 0.0])
     frames = live.replies(JOINTS * quiet.tick_count).reshape(-1, JOINTS)
-    angles = np.array([positions(robot, one) for one in frames])
+    angles = np.array([positions(robot, frame) for frame in frames])
     assert np.ptp(angles[40:, 0]) < 0.1 * np.ptp(angles[40:, 2])

@@ -311,8 +311,8 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, name, command):
     path = tmp_path / "a.mcap"
     error = command("sim", "run", tmp_path / "bad.toml", "-o", path, code=1).err
     complaint = error.strip().removeprefix("error: ")
-    found = re.match(r"the twin failed at (\d+\.\d+) s: (.*)(link|joint)\d\d ", complaint)
-    assert found
+    match = re.match(r"the twin failed at (\d+\.\d+) s: (.*)(link|joint)\d\d ", complaint)
+    assert match
     assert f"likely cause: {cause}" in complaint
     if name in ("gear", "rotor"):
         assert "the servo of joint03 turns at" in complaint
@@ -322,7 +322,7 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, name, command):
         angles = columns(session, "/joint_states")
         times = columns(session, "/energy_ledger").shape[0]
     # All samples from before the failure, none from after it, and all of them sound.
-    assert times == math.floor(float(found[1]) * 100 - 1e-6) + 1
+    assert times == math.floor(float(match[1]) * 100 - 1e-6) + 1
     assert np.abs(angles).max(initial=0.0) < np.pi
 
 

@@ -85,8 +85,8 @@ def test_the_ledger_agrees_with_the_logged_torques(make_scenario, make_robot):
         sensed = [one for sample in samples for one in sample.sensed] + twin.flush()
     joints = [one for one in sensed if isinstance(one, JointSample)]
     assert len(joints) == len(samples) == 401
-    power = [(one.effort * one.velocity).sum() for one in joints]
-    electrical = [(one.voltage * one.current).sum() for one in joints]
+    power = [(joint.effort * joint.velocity).sum() for joint in joints]
+    electrical = [(joint.voltage * joint.current).sum() for joint in joints]
     energy = energies(samples[-1])
     assert np.trapezoid(power, dx=0.01) == pytest.approx(energy["mechanical_net"], rel=0.02)
     assert np.trapezoid(electrical, dx=0.01) == pytest.approx(energy["electrical_net"], rel=0.02)

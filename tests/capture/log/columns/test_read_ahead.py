@@ -108,8 +108,8 @@ def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_p
     path = tmp_path / "s.mcap"
     write_session(path, 10_000)
     log_file = LogFile(path)
-    ids = [key for key, each in log_file.channels.items() if each.topic in TOPICS]
-    blocks = [each for each in log_file.blocks if not each.index_at.keys().isdisjoint(ids)]
+    ids = [key for key, channel in log_file.channels.items() if channel.topic in TOPICS]
+    blocks = [block for block in log_file.blocks if not block.index_at.keys().isdisjoint(ids)]
     data = bytearray(path.read_bytes())
     log_file.close()
     assert len(blocks) > 12

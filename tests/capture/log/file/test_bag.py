@@ -21,9 +21,9 @@ MODES = pytest.mark.parametrize(
 
 def filled(bag, rows=slice(None)):
     """Write JointStates of two joints."""
-    own = Filler(bag)
+    filler = Filler(bag)
     for t_ns, values in zip(TIMES_NS[rows].tolist(), TRUTH[rows], strict=True):
-        own.state(t_ns, 0.0, positions=values, names=["a", "b"])
+        filler.state(t_ns, 0.0, positions=values, names=["a", "b"])
 
 
 def check(path):

@@ -132,7 +132,7 @@ def test_channels_opened_late_have_the_same_number_in_all_parts(tmp_path):
         assert session.warnings == []
     health = check_session(path)
     assert health.file.damage == ()
-    assert all(each.sequence.dropped in (0, None) for each in health.channels)
+    assert all(channel.sequence.dropped in (0, None) for channel in health.channels)
 
 
 def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):

@@ -32,7 +32,7 @@ def write(tmp_path):
 
 
 def joint_of(health, name, topic="/joint_states"):
-    (found,) = [each for each in health.joints if (each.topic, each.name) == (topic, name)]
+    (found,) = [joint for joint in health.joints if (joint.topic, joint.name) == (topic, name)]
     return found
 
 
@@ -48,8 +48,8 @@ def test_a_clean_session_is_good_without_a_finding(clean, command):
     assert timing.median_s == pytest.approx(0.01, abs=1e-12)
     assert timing.rate_hz == pytest.approx(100.0)
     assert timing.std_s == pytest.approx(0.0, abs=1e-6)
-    assert {each.sequence.kind for each in health.channels} == {"counted"}
-    assert {each.sequence.dropped for each in health.channels} == {0}
+    assert {channel.sequence.kind for channel in health.channels} == {"counted"}
+    assert {channel.sequence.dropped for channel in health.channels} == {0}
     assert joint_of(health, "joint07").frozen_s == 0
     report = command("log", "check", clean).out
     assert report.startswith("good: s, snake25, 19.99 s\n")
@@ -158,7 +158,7 @@ def test_blocks_don_t_change_a_timing(steps, cuts):
 def test_dropped_sequence_numbers_are_proved(tmp_path):
     kept = [k for k in range(1, 500) if k not in {100, 101, 350}]
     health = check_session(write_raw(tmp_path / "s.mcap", kept))
-    assert {each.sequence.dropped for each in health.channels} == {3}
+    assert {channel.sequence.dropped for channel in health.channels} == {3}
     assert health.verdict == "degraded"
     dropped = "3 of 499 messages were dropped (0.60%), as its sequence numbers prove"
     assert f"/joint_commands and /joint_states, each: {dropped}" in health.reasons
@@ -167,8 +167,8 @@ def test_dropped_sequence_numbers_are_proved(tmp_path):
 def test_zeros_are_no_sequence_numbers(tmp_path, command):
     path = write_raw(tmp_path / "s.mcap", [0] * 300)
     health = check_session(path)
-    assert {each.sequence.kind for each in health.channels} == {"none"}
-    assert {each.sequence.dropped for each in health.channels} == {None}
+    assert {channel.sequence.kind for channel in health.channels} == {"none"}
+    assert {channel.sequence.dropped for channel in health.channels} == {None}
     assert "no sequence numbers, so drops can't be proved" in command("log", "check", path).out
 
 

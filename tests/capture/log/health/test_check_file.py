@@ -133,9 +133,9 @@ def foreign(path, topic, names):
 
 def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
     health = check_session(foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]]))
-    gaps = {each.label: each.timing.gaps for each in health.series}
+    gaps = {series.label: series.timing.gaps for series in health.series}
     assert gaps == {f"/joint_states ({name})": 0 for name in "abc"}
-    assert [each.sequence.kind for each in health.channels] == ["none"]
+    assert [channel.sequence.kind for channel in health.channels] == ["none"]
     assert health.reasons == ("/joint_commands is missing; joints are on /joint_states",)
 
 

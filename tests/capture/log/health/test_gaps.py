@@ -172,7 +172,9 @@ def test_a_controller_that_is_late_in_a_tenth_of_its_cycles_is_not_bad(tmp_path)
     health = check_session(session(tmp_path / "s.mcap", stamps))
     assert health.verdict != "bad"
     assert not any("missing" in finding.sentence for finding in health.findings)
-    (late,) = [each.sentence for each in health.findings if "late command cycles" in each.sentence]
+    (late,) = [
+        finding.sentence for finding in health.findings if "late command cycles" in finding.sentence
+    ]
     assert late.startswith("/joint_commands (a) and /joint_states (a), late together: at most ")
     assert "none lost in them" in late
 
@@ -226,7 +228,7 @@ def test_only_counters_that_exclude_a_loss_make_a_skipped_cycle(counters, sequen
         channel("/joint_commands", "counted", sequence, 0),
         channel("/joint_states", "none", None, None),
     ]
-    sources = [SourceHealth(f"can{k}", 9, **each) for k, each in enumerate(counters)]
+    sources = [SourceHealth(f"can{k}", 9, **counter) for k, counter in enumerate(counters)]
     found = with_skipped_cycles(every, channels, sources, "/joint_commands")
     missing = [each.timing.missing for each in found]
     assert missing == ([0, 0, 4] if proved else [4, 4, 4])

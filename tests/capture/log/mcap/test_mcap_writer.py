@@ -122,8 +122,8 @@ def numbers_in(stream):
     """Sequence numbers of the messages of a file that has no end yet."""
     found = []
     with contextlib.suppress(EndOfFile):
-        for one in StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records:
-            found += [one.sequence] if isinstance(one, Message) else []
+        for record in StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records:
+            found += [record.sequence] if isinstance(record, Message) else []
     return found
 
 

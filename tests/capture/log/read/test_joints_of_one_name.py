@@ -101,7 +101,7 @@ def test_the_check_and_the_contract_find_it(tmp_path, names, commanded, topics):
     path = write(tmp_path / "run.mcap", names, commanded)
     health = check_session(path)
     assert health.verdict == "degraded"
-    (finding,) = [one for one in health.findings if "are named" in one.sentence]
+    (finding,) = [finding for finding in health.findings if "are named" in finding.sentence]
     assert finding.sentence == f"{topics}: {SENTENCE}; give each its name"
     named = [v for v in check_contract(path) if v.found == "yaw3 more than once"]
     assert [v.where for v in named] == [
@@ -111,7 +111,7 @@ def test_the_check_and_the_contract_find_it(tmp_path, names, commanded, topics):
 
 def test_a_log_of_distinct_names_is_good(tmp_path):
     health = check_session(write(tmp_path / "run.mcap", ALL_APART, ALL_APART))
-    assert not [one for one in health.findings if "are named" in one.sentence]
+    assert not [finding for finding in health.findings if "are named" in finding.sentence]
 
 
 def test_the_points_of_a_trajectory_keep_both_joints(tmp_path):

@@ -41,7 +41,7 @@ def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(tmp_pat
     channel = log.channel("/other", log.schema(kind))
     log.chunk([*ticks(), (channel, EPOCH_NS, b"")])
     health = check_session(log.write(tmp_path / "run.mcap"))
-    (other,) = (each for each in health.channels if each.topic == "/other")
+    (other,) = (channel for channel in health.channels if channel.topic == "/other")
     assert (other.count, other.unread) == (1, 1)
 
 
@@ -51,7 +51,9 @@ def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(tmp
     times = [EPOCH_NS + NS + k * 10_000 for k in range(5_000)]
     log.chunk([*ticks(), *((2, t, joint_state(t, [f"joint{t}"], [0.5])) for t in times)])
     path = log.write(tmp_path / "run.mcap")
-    (states,) = (each for each in check_session(path).channels if each.topic == "/joint_states")
+    (states,) = (
+        channel for channel in check_session(path).channels if channel.topic == "/joint_states"
+    )
     assert states.unread == 5_000 - 255  # with the list of the sound messages, 256
     why = "/joint_states has more than 256 different lists of joints"
     assert f"error: {path}: {why}" in command("analyse", path, code=1).err
@@ -62,7 +64,9 @@ def test_more_joints_than_are_judged_are_a_finding(tmp_path):
     message = joint_state(EPOCH_NS, [f"j{k}" for k in range(2001)], np.zeros(2001))
     log.chunk([(channel, EPOCH_NS, message) for channel in (1, 2)])
     health = check_session(log.write(tmp_path / "run.mcap"))
-    assert any("/joint_commands has 2001 joints; at most 2000" in one for one in health.reasons)
+    assert any(
+        "/joint_commands has 2001 joints; at most 2000" in reason for reason in health.reasons
+    )
 
 
 @pytest.mark.slow
@@ -111,7 +115,7 @@ def test_types_that_no_reader_could_hold_are_refused(tmp_path, kind):
         log.chunk([*ticks(), (channel, EPOCH_NS, b"\0\1\0\0\1\0\0\0" + path.stem.encode())])
         log.write(path)
     health = check_session(paths[0])
-    assert [each.count for each in health.channels if each.topic == "/odd"] == [1]
+    assert [channel.count for channel in health.channels if channel.topic == "/odd"] == [1]
     assert any(complaint in note for note in health.notes)
     assert merge_logs(paths, tmp_path / "both.mcap").messages["/odd"] == 2
 
@@ -122,7 +126,7 @@ def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path):
     channel = log.channel("/odd", log.schema("p/msg/Top", text))
     log.chunk([*ticks(), (channel, EPOCH_NS, b"\0\1\0\0\1\0\0\0")])
     health = check_session(log.write(tmp_path / "run.mcap"))
-    assert [each.unread for each in health.channels if each.topic == "/odd"] == [1]
+    assert [channel.unread for channel in health.channels if channel.topic == "/odd"] == [1]
 
 
 @pytest.mark.slow

@@ -149,7 +149,9 @@ def test_the_analysis_of_a_session_with_pauses_accuses_no_joint_and_has_its_gain
     assert np.degrees([joint.lag_rad.value for joint in result.joints]) == pytest.approx(
         [np.degrees(0.2)] * 9, abs=0.2
     )
-    (warning,) = [one for one in result.warnings if "repeat their values together" in one]
+    (warning,) = [
+        warning for warning in result.warnings if "repeat their values together" in warning
+    ]
     lasted = sum(stop - start + 0.01 for start, stop in spans)
     assert f"for {lasted:.3g} s, in {len(spans)} pause" in warning
 
@@ -161,11 +163,15 @@ def test_the_check_names_the_bus_where_all_joints_freeze_and_a_joint_where_one_d
         still = np.zeros_like(measured)
         path = tmp_path / f"{name}.mcap"
         write_joints(path, NAMES, commands, (measured, still, still), rate_hz=RATE_HZ)
-        sentences = [one.sentence for one in check_session(path).findings]
-        together = [one for one in sentences if "all joints repeat their values for 3 s" in one]
+        sentences = [finding.sentence for finding in check_session(path).findings]
+        together = [
+            sentence
+            for sentence in sentences
+            if "all joints repeat their values for 3 s" in sentence
+        ]
         assert len(together) == (name == "all")
-        assert not [one for one in sentences if "are frozen or missing" in one]
-        frozen = [one for one in sentences if "frozen for 3 s" in one]
+        assert not [sentence for sentence in sentences if "are frozen or missing" in sentence]
+        frozen = [sentence for sentence in sentences if "frozen for 3 s" in sentence]
         assert len(frozen) == (name == "one")
 
 
@@ -178,4 +184,6 @@ def test_joints_that_are_frozen_for_most_of_the_session_stay_dead_in_the_check(t
     )
     health = check_session(path)
     assert health.verdict == "bad"
-    assert "9 of 9 joints are frozen or missing" in [one.sentence for one in health.findings]
+    assert "9 of 9 joints are frozen or missing" in [
+        finding.sentence for finding in health.findings
+    ]

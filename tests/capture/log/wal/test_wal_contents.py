@@ -66,12 +66,12 @@ def test_the_contents_of_a_log(tmp_path):
     first = tmp_path / "x.mcap"
     assert read_wal(first) is None
     filled(wal_folder(first), 100)
-    found = read_wal(first)
-    assert found.folder == wal_folder(first)
-    assert check_messages(list(found.messages)) == list(range(1, 101))
-    assert (found.accepted, found.before, found.live) == (100, 0, False)
-    assert (found.warnings, found.damaged) == ((), False)
-    assert found.definitions
+    wal = read_wal(first)
+    assert wal.folder == wal_folder(first)
+    assert check_messages(list(wal.messages)) == list(range(1, 101))
+    assert (wal.accepted, wal.before, wal.live) == (100, 0, False)
+    assert (wal.warnings, wal.damaged) == ((), False)
+    assert wal.definitions
     (wal_folder(first) / "000001.seg").unlink()
     later = read_wal(first)
     assert later.before == later.messages[0].position - 1 > 0
@@ -93,13 +93,13 @@ def test_the_contents_of_a_log(tmp_path):
 def test_a_log_without_segments_says_so_unless_it_is_written(tmp_path):
     folder = wal_folder(tmp_path / "x.mcap")
     folder.mkdir()
-    found = read_wal(tmp_path / "x.mcap")
-    assert (found.accepted, found.before, found.messages, found.live) == (0, 0, (), False)
-    assert "no segment of a write-ahead log" in found.warnings[0]
+    wal = read_wal(tmp_path / "x.mcap")
+    assert (wal.accepted, wal.before, wal.messages, wal.live) == (0, 0, (), False)
+    assert "no segment of a write-ahead log" in wal.warnings[0]
     lock = WalLock(folder)
     assert is_live(folder)
-    found = read_wal(tmp_path / "x.mcap")
-    assert (found.live, found.warnings) == (True, ())
+    wal = read_wal(tmp_path / "x.mcap")
+    assert (wal.live, wal.warnings) == (True, ())
     with pytest.raises(LogWriteError, match="another recorder is writing it"):
         WalLock(folder)
     assert lock.folder == folder

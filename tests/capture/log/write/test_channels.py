@@ -102,10 +102,10 @@ def test_transforms_are_rounded_for_viewers(tmp_path):
         ((positions, turns), LOGGED),
     )
     assert raw == TIMES
-    for k, one in enumerate(found.transforms):
-        assert stamp_ns(one.header) == EPOCH_NS
-        assert (one.header.frame_id, one.child_frame_id) == ("world", "ab"[k])
-        got = [*row(one.transform.translation), *row(one.transform.rotation, "xyzw")]
+    for k, transform in enumerate(found.transforms):
+        assert stamp_ns(transform.header) == EPOCH_NS
+        assert (transform.header.frame_id, transform.child_frame_id) == ("world", "ab"[k])
+        got = [*row(transform.transform.translation), *row(transform.transform.rotation, "xyzw")]
         np.testing.assert_allclose(got, [*positions[k], *turns[k]], rtol=0, atol=2.0**-15)
         assert (np.array(got) * 2**14 % 1 == 0).all()
 
@@ -218,7 +218,7 @@ def test_diagnostics(tmp_path):
     assert stamp_ns(found.header) == EPOCH_NS
     listed = [(one.level, one.name, one.message, one.hardware_id) for one in found.status]
     assert listed == [(0, "source a", "fine", ""), (2, "disk", "full", "/dev/x")]
-    assert [(one.key, one.value) for one in found.status[1].values] == [
+    assert [(value.key, value.value) for value in found.status[1].values] == [
         ("free", "0"),
         ("left", "3"),
     ]
@@ -257,14 +257,14 @@ def test_channels_have_units_and_a_topic_has_one(tmp_path):
             writer.string("/s")
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    found = {one.topic: one for one in summary.channels.values()}
+    found = {channel.topic: channel for channel in summary.channels.values()}
     assert {topic: one.metadata for topic, one in found.items()} == {
         "/j": {"unit": "deg"}, "/r": {"unit": "m"}, "/m": {"unit": "T"}, "/raw": {"k": "v"},
         "/s": {},
     }  # fmt: skip
     assert {one.message_encoding for one in found.values()} == {"cdr"}
     assert found["/raw"].schema_id == found["/s"].schema_id  # a type has one schema
-    names = {key: one.name for key, one in summary.schemas.items()}
+    names = {key: schema.name for key, schema in summary.schemas.items()}
     assert names[found["/r"].schema_id] == "sensor_msgs/msg/Range"
     assert len(set(names.values())) == len(names)
 
@@ -283,7 +283,9 @@ def test_a_session_explains_itself(tmp_path):
     assert found["late"] == {"a": "2"}
     assert found["undulog.health"]["verdict"] == "degraded"
     with path.open("rb") as stream:
-        attached = {one.name: one for one in make_reader(stream).iter_attachments()}
+        attached = {
+            attachment.name: attachment for attachment in make_reader(stream).iter_attachments()
+        }
     assert attached["robot.toml"].data == robot.toml.encode()
     assert attached["robot.toml"].media_type == "application/toml"
     assert attached["snake25.dbc"].data == dict(robot.databases)["snake25.dbc"].encode()

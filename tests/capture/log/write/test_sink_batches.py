@@ -48,7 +48,7 @@ def batch_of(*messages):
 
 
 def states_of(sinks):
-    return [(one.messages, one.part, one._part.size) for one in sinks]
+    return [(sink.messages, sink.part, sink._part.size) for sink in sinks]
 
 
 @pytest.mark.parametrize(

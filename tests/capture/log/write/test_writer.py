@@ -20,7 +20,9 @@ FACTS = {"session_id": "s", "epoch_ns": EPOCH_NS}
 
 def attachments(path):
     with path.open("rb") as stream:
-        return {one.name: one for one in make_reader(stream).iter_attachments()}
+        return {
+            attachment.name: attachment for attachment in make_reader(stream).iter_attachments()
+        }
 
 
 def test_a_robot_has_its_files_and_its_serial_number_if_it_has_one(tmp_path):
@@ -131,4 +133,8 @@ def test_of_rows_no_time_may_lie_outside_what_a_stamp_holds(tmp_path, at):
                 channel.write_rows(times, np.zeros((3, 1)), none, none)
         channel.write_rows(times[:0], np.zeros((0, 1)), none[:0], none[:0])
     stamps = [c.header.stamp for *_, c in decoded_of(tmp_path / "run.mcap")]
-    assert [(one.sec, one.nanosec) for one in stamps] == [(0, 0), (0, 1), (2**31 - 1, 10**9 - 1)]
+    assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [
+        (0, 0),
+        (0, 1),
+        (2**31 - 1, 10**9 - 1),
+    ]
