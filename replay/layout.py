@@ -27,7 +27,7 @@ from .draw.body import body_title
 from .draw.heat_maps import VISIBLE
 from .draw.steps import SEGMENTS
 from .samples import content as entities
-from .samples.content import Content, Series, Start, Tab
+from .samples.content import Content, InitialPose, PlottedSeries, Tab
 from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME
 
 BEFORE_CURSOR_S = 4.0
@@ -153,7 +153,7 @@ def _grid(span: float) -> rrb.LineGrid3D:
     )
 
 
-def _beside(start: Start, offset: tuple[float, float, float]) -> tuple[float, float, float]:
+def _beside(start: InitialPose, offset: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return a point given forward, left and up of the head at the start [m]."""
     cos, sin = math.cos(start.heading), math.sin(start.heading)
     x, y, z = start.position
@@ -237,7 +237,7 @@ def _plane_of_places(content: Content) -> set[str] | None:
 
 
 def _joint_plot(
-    title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
+    title: str, series: Sequence[PlottedSeries], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """Return a plot with a line for each joint; ``names`` are visible at first."""
     contents = [channel.entity for channel in series]
@@ -245,7 +245,7 @@ def _joint_plot(
 
 
 def _lines(
-    series: Sequence[Series], names: set[str] | None
+    series: Sequence[PlottedSeries], names: set[str] | None
 ) -> dict[EntityPathLike, rrb.Visualizer]:
     visualizers: dict[EntityPathLike, rrb.Visualizer] = {}
     for one in series:

@@ -28,7 +28,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.common.waits import Standstill, attended
 
 from .draw import mean_cycle
-from .draw.drawing import Drawing, Sources, clock_of
+from .draw.drawing import RerunDrawing, Sources, clock_of
 from .draw.heat_maps import POWER
 from .draw.lines import MODE
 from .draw.motion import BODY_RATE_HZ
@@ -46,11 +46,11 @@ from .samples.content import (
     Content,
     Layer,
     MeanCycle,
-    Series,
+    PlottedSeries,
     Tab,
 )
 from .samples.quantities import GAIT, Survey, comes, survey
-from .samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
+from .samples.timeline import STRETCH_NS, DrawnSpan, LoggedRhythm, SpanSamples, stretches
 from .samples.tracks import wanted_fields
 from .stream import BoundedStream, keep_for_ever
 from .viewer import Viewer
@@ -70,7 +70,7 @@ _TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it
 _FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
 
-def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
+def predict_layout(content: Content, rhythm: LoggedRhythm | None) -> Content:
     """Add the views that an analysis of such a session adds.
 
     Args:
@@ -103,7 +103,8 @@ def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
             AwaitedMap(f"{MAPS}/{one.key}", f"{one.name} map [{one.unit}]") for one in mapped
         ),
         cycles=tuple(
-            (quantity, (Series(f"{CYCLES}/{quantity.key}", measured),)) for quantity in quantities
+            (quantity, (PlottedSeries(f"{CYCLES}/{quantity.key}", measured),))
+            for quantity in quantities
         ),
         mean=MeanCycle(
             period_s=float(np.ptp(rhythm.t_ns)) * 1e-9 / cycles,
@@ -135,12 +136,12 @@ def _arrangement(content: Content) -> tuple[object, ...]:
     return views, lines, content.modes > 1
 
 
-def _names(series: tuple[Series, ...]) -> tuple[str, ...]:
+def _names(series: tuple[PlottedSeries, ...]) -> tuple[str, ...]:
     return tuple(name for channel in series for name in channel.names)
 
 
-def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
-    return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
+def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[PlottedSeries, ...]:
+    return (PlottedSeries(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
 
 
 class NoLongerWantedError(Exception):
@@ -288,7 +289,9 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     first = next(parts)
     rec = sink.open(identity)
     send_properties(rec, session.session_id, session.start_ns)
-    drawing = Drawing(rec, clock, Sources.of(session, found), task.known.named, span=first.span)
+    drawing = RerunDrawing(
+        rec, clock, Sources.of(session, found), task.known.named, span=first.span
+    )
     words_first = _words(session) <= _FEW_WORDS
     if words_first:
         drawing.write_words()
@@ -304,7 +307,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     task.begun()
 
     if drawn.known_ns is not None:
-        drawing.widen(_whole(session, found), Span(start_ns=drawn.stop_ns))
+        drawing.widen(_whole(session, found), DrawnSpan(start_ns=drawn.stop_ns))
     if not words_first:
         drawing.write_words()
     drawing.write_others()
@@ -334,7 +337,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
 class _Numbers:
     """The session's numbers, drawn as soon as they are known."""
 
-    def __init__(self, task: Task, drawing: Drawing) -> None:
+    def __init__(self, task: Task, drawing: RerunDrawing) -> None:
         self._task, self._drawing = task, drawing
         self._drawn: Layer | None = None
 
@@ -366,7 +369,7 @@ def _whole(session: SessionView, found: Survey) -> Survey:
     return replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
 
 
-def _require_nothing_new(stretch: Stretch, found: Survey) -> None:
+def _require_nothing_new(stretch: SpanSamples, found: Survey) -> None:
     """Look for joints in a stretch that a brief survey didn't see."""
     for key, tracks in stretch.columns.items():
         new = [track.name for track in tracks if track.name not in found.seen.get(key, ())]

@@ -27,7 +27,7 @@ from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
 
-from .draw.drawing import Drawing, Sources, clock_of
+from .draw.drawing import RerunDrawing, Sources, clock_of
 from .draw.mean_cycle import Averaged
 from .layout import build_blueprint
 from .samples.content import Content, Layer, Named
@@ -99,7 +99,7 @@ def write_recording(
     identity = recording_id(session.session_id)
     with recording_file(path, identity, session.session_id, session.start_ns) as rec:
         averaged = Averaged(clock, analysis)
-        drawing = Drawing(rec, clock, sources, layer.named, averaged=averaged)
+        drawing = RerunDrawing(rec, clock, sources, layer.named, averaged=averaged)
         session.forget()
         for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
             drawing.write(stretch)

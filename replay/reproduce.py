@@ -26,7 +26,7 @@ from undulog.sim.drive.in_process import drive_twin
 from undulog.sim.drive.motion import MotionSource, find_motion
 from undulog.sim.scenario.scenario import Scenario
 from undulog.sim.scenario.scenario_file import load_scenario
-from undulog.sim.twin.recording import Recording
+from undulog.sim.twin.recording import TwinRecording
 from undulog.sim.twin.twin import Sample
 
 EVENTS = "/rosout"
@@ -123,7 +123,7 @@ class ReproducedRun:
 
     original: Path
     scenario: Scenario
-    recording: Recording
+    recording: TwinRecording
     same: LogDifference | None
     comparison: Comparison | None
     not_compared: str | None

@@ -22,7 +22,7 @@ from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.segments.examine import Chain, examine
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 GAIN, LAG = 0.95, np.radians(10.0)
 JOINTS = 9
@@ -152,7 +152,7 @@ def stated(recorded):
     """
     joints, planes, t_s, command, position = recorded
     motions = [
-        JointMotion(name, Samples(t_s, asked), Samples(t_s, moved))
+        RecordedJoint(name, Samples(t_s, asked), Samples(t_s, moved))
         for name, asked, moved in zip(joints, command, position, strict=True)
     ]
     broken = tuple(fault.joint for fault in judge(motions).faults)

@@ -14,7 +14,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from undulog.analysis.catalog.change_points import Kind, find_change_points
+from undulog.analysis.catalog.change_points import DepartureKind, find_change_points
 from undulog.analysis.catalog.session_noise import relative_to_others
 
 JOINTS, DAY_S = 8, 86_400.0
@@ -106,7 +106,7 @@ def judge(case: Case, seed: int) -> dict[str, bool]:
     relative = [relative_to_others(values, nothing) for values in series]
     judged = find_change_points(relative, DAY_S * np.arange(n, dtype=np.float64), nothing)
     points = [(k, point) for k, quantity in enumerate(judged) for point in quantity.points]
-    changes = [(k, point) for k, point in points if point.kind is not Kind.OUTLIER]
+    changes = [(k, point) for k, point in points if point.kind is not DepartureKind.OUTLIER]
     mine = [point for k, point in changes if (k, point.joint) == (0, joint)]
     near = [min(mine, key=lambda p: abs(p.session - start), default=None) for start in starts]
     truths = [*zip(near, starts, np.log1p(case.steps), strict=True)]

@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-from undulog.analysis.experiment.kick_runs import Kick, Kind
+from undulog.analysis.experiment.kick_runs import Kick, KickKind
 from undulog.analysis.experiment.local_coupling import (
     ResponseMatrices,
     local_matrices,
@@ -47,7 +47,7 @@ def chain(m, *, coupled=True):
 
 def plan(m, base_runs=6):
     """Return the kicks of an experiment, None for a run of the gait as it is."""
-    kinds = (Kind.PHASE, Kind.AMPLITUDE)
+    kinds = (KickKind.PHASE, KickKind.AMPLITUDE)
     each = [Kick(j, kind, s * KICK) for kind in kinds for j in range(m) for s in (1, -1)]
     return [None] * base_runs + each
 
@@ -72,7 +72,7 @@ def experiments(random, count, kicks, H, c, *, scatter, how="each"):
     step = np.zeros((len(kicks), m), dtype=complex)
     for k, kick in enumerate(kicks):
         if kick is not None:
-            step[k, kick.joint] = kick.size * (1j if kick.kind is Kind.PHASE else 1.0)
+            step[k, kick.joint] = kick.size * (1j if kick.kind is KickKind.PHASE else 1.0)
     clean = np.log((c * np.exp(step)) @ H.T / (H @ c))
     shape = clean.shape
     base = [k for k, kick in enumerate(kicks) if kick is None]

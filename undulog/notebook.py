@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from undulog.analysis import Analysis, Choices, Comparison, Experiment, Options
     from undulog.capture import SessionView
     from undulog.sim import Scenario
-    from undulog.sim.twin.recording import Recording
+    from undulog.sim.twin.recording import TwinRecording
 
     SessionLike: TypeAlias = SessionView | Path | str
     """An open session or a view of one, or the path or URL of a session."""
@@ -83,7 +83,7 @@ def record(
     duration_s: float | None = None,
     seed: int | None = None,
     force: bool = False,
-) -> Recording:
+) -> TwinRecording:
     """Run the twin into a session file, as ``undulog sim run`` does.
 
     Args:

@@ -46,7 +46,7 @@ _BENT_RAD = float(np.radians(2.0))
 
 
 @dataclass(frozen=True)
-class Track:
+class BodyTrack:
     """Positions of head, middle and tail, and the mean heading of the body.
 
     Attributes:
@@ -83,7 +83,7 @@ class Poses(NamedTuple):
     quaternion: FloatArray
 
 
-def track(robot: Robot, poses: Poses, angles: Sequence[Series]) -> Track:
+def track(robot: Robot, poses: Poses, angles: Sequence[Series]) -> BodyTrack:
     """Follow three links from the head's poses and the joint angles.
 
     Args:
@@ -106,8 +106,8 @@ def track(robot: Robot, poses: Poses, angles: Sequence[Series]) -> Track:
     size = float(np.linalg.norm(chord))
     heading = chord / size if size > 0 else np.array([1.0, 0.0, 0.0])
     if not times:
-        return Track(np.zeros(0), np.zeros((0, 3, 3)), heading)
-    return Track(np.concatenate(times), np.concatenate(places), heading)
+        return BodyTrack(np.zeros(0), np.zeros((0, 3, 3)), heading)
+    return BodyTrack(np.concatenate(times), np.concatenate(places), heading)
 
 
 def link_centres(
@@ -132,7 +132,7 @@ def link_centres(
         yield t_s[rows], link_positions(robot, position[rows], rotation, shape)
 
 
-def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[BodyPoint, ...]:
+def observed(robot: Robot, plane: Plane, seen: BodyTrack, omega: float) -> tuple[BodyPoint, ...]:
     """Transverse amplitude and phase of head, middle and tail.
 
     Args:

@@ -27,7 +27,7 @@ SAMPLES = 128
 
 
 @dataclass(frozen=True)
-class Chain:
+class RigidChain:
     """A planar chain of rigid links, head first.
 
     Attributes:
@@ -44,7 +44,7 @@ class Chain:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ChainMotion:
     """Motion of a chain over one cycle, from the head at the origin along x.
 
     Attributes:
@@ -62,7 +62,7 @@ class Motion:
     turn: float
 
 
-def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> Chain:
+def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> RigidChain:
     """Return the robot's chain under anisotropic viscous drag, without inertia.
 
     Args:
@@ -72,10 +72,10 @@ def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> Chain:
         The chain with c_t = 1; the motion doesn't depend on it.
     """
     length = np.array([link.length for link in robot.links])
-    return Chain(length, length, ratio * length, ratio * length**3 / 12)
+    return RigidChain(length, length, ratio * length, ratio * length**3 / 12)
 
 
-def free_chain(robot: Robot, plane: Plane) -> Chain:
+def free_chain(robot: Robot, plane: Plane) -> RigidChain:
     """Return the robot's chain that nothing touches, at rest as a whole.
 
     Args:
@@ -84,10 +84,12 @@ def free_chain(robot: Robot, plane: Plane) -> Chain:
     length = np.array([link.length for link in robot.links])
     mass = np.array([link.mass for link in robot.links])
     axis = 2 if plane is Plane.HORIZONTAL else 1
-    return Chain(length, mass, mass, np.array([link.inertia[axis] for link in robot.links]))
+    return RigidChain(length, mass, mass, np.array([link.inertia[axis] for link in robot.links]))
 
 
-def one_cycle(chain: Chain, amplitudes: ComplexArray, offsets: FloatArray, omega: float) -> Motion:
+def one_cycle(
+    chain: RigidChain, amplitudes: ComplexArray, offsets: FloatArray, omega: float
+) -> ChainMotion:
     """Move a chain through one cycle of its gait.
 
     Args:
@@ -106,7 +108,7 @@ def one_cycle(chain: Chain, amplitudes: ComplexArray, offsets: FloatArray, omega
     angles = offsets + np.real(wave @ amplitudes.T)
     velocity = _head_velocity(chain, angles, np.real((1j * order * omega * wave) @ amplitudes.T))
     head, heading, displacement, turn = travel(velocity, omega)
-    return Motion(head, heading, angles, displacement, turn)
+    return ChainMotion(head, heading, angles, displacement, turn)
 
 
 def travel(velocity: FloatArray, omega: float) -> tuple[ComplexArray, FloatArray, complex, float]:
@@ -139,7 +141,9 @@ def travel(velocity: FloatArray, omega: float) -> tuple[ComplexArray, FloatArray
     return path[:-1], heading, complex(path[-1]), 2 * np.pi * mean_turn / omega
 
 
-def places(chain: Chain, motion: Motion, links: tuple[int, ...], cycles: int) -> ComplexArray:
+def places(
+    chain: RigidChain, motion: ChainMotion, links: tuple[int, ...], cycles: int
+) -> ComplexArray:
     """Where some links are over several cycles.
 
     Args:
@@ -159,7 +163,7 @@ def places(chain: Chain, motion: Motion, links: tuple[int, ...], cycles: int) ->
     return np.concatenate(parts)
 
 
-def _shape(chain: Chain, angles: FloatArray) -> tuple[ComplexArray, FloatArray]:
+def _shape(chain: RigidChain, angles: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Link centres x + j y and orientations in the head's frame, each of shape (t, n)."""
     turned = np.concatenate([np.zeros((angles.shape[0], 1)), np.cumsum(angles, axis=1)], axis=1)
     half = chain.length / 2 * np.exp(1j * turned)
@@ -170,7 +174,7 @@ def _shape(chain: Chain, angles: FloatArray) -> tuple[ComplexArray, FloatArray]:
     return centre, turned
 
 
-def _head_velocity(chain: Chain, angles: FloatArray, rates: FloatArray) -> FloatArray:
+def _head_velocity(chain: RigidChain, angles: FloatArray, rates: FloatArray) -> FloatArray:
     """Return the head's velocity (forward, left, turning) in its own frame, shape (t, 3)."""
     centre, turned = _shape(chain, angles)
     spin = np.concatenate([np.zeros((rates.shape[0], 1)), np.cumsum(rates, axis=1)], axis=1)

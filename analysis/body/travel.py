@@ -50,7 +50,7 @@ PHASES: FloatArray = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
 
 
 @dataclass(frozen=True)
-class Steps:
+class CycleSteps:
     """How far the centre of mass moved in each whole cycle.
 
     Attributes:
@@ -65,7 +65,7 @@ class Steps:
 
 def body_steps(
     session: SessionView, responses: Mapping[str, Series], span: Span, warn: Warn
-) -> Steps | None:
+) -> CycleSteps | None:
     """Follow the centre of mass from cycle to cycle.
 
     Args:
@@ -97,7 +97,7 @@ def body_steps(
     net = step.sum(axis=0)
     way = net / max(float(np.linalg.norm(net)), np.finfo(np.float64).tiny)
     cycle_s = (span.stop_s - span.start_s) / span.cycles
-    return Steps(step @ way, cycle_s, sum(link.mass for link in robot.links))
+    return CycleSteps(step @ way, cycle_s, sum(link.mass for link in robot.links))
 
 
 def centre_of_mass(robot: Robot, t_s: FloatArray, poses: Poses, angles: FloatArray) -> FloatArray:
@@ -159,7 +159,7 @@ def mean_step(steps: FloatArray, least: float = -np.inf, most: float = np.inf) -
     return Estimate(value, (max(least, low), min(most, high)))
 
 
-def speed(steps: Steps) -> tuple[float, float, float] | None:
+def speed(steps: CycleSteps) -> tuple[float, float, float] | None:
     """Speed of the centre of mass along its net displacement.
 
     Returns:
@@ -168,7 +168,7 @@ def speed(steps: Steps) -> tuple[float, float, float] | None:
     return mean_of_cycles(steps.forward_m / steps.cycle_s)
 
 
-def cost_of_transport(steps: Steps, energy_j: FloatArray) -> tuple[float, float, float] | None:
+def cost_of_transport(steps: CycleSteps, energy_j: FloatArray) -> tuple[float, float, float] | None:
     """E_abs / (m g d), a ratio of means over cycles (delta method).
 
     Args:

@@ -52,7 +52,7 @@ from .rows import (
     sweep_rows,
     table_of,
 )
-from .sources import Source, list_sources, source_facts
+from .sources import ResultSource, list_sources, source_facts
 
 _BATCH = 2000
 """Files that are read before their rows are written."""
@@ -319,14 +319,14 @@ class Catalog:
     # -- inside ----------------------------------------------------------------------------------
 
     def _read_files(
-        self, files: Sequence[Source]
-    ) -> Iterable[tuple[Source, dict[str, list[Row]], str]]:
+        self, files: Sequence[ResultSource]
+    ) -> Iterable[tuple[ResultSource, dict[str, list[Row]], str]]:
         if self._store.is_local:
             return map(self._read_file, files)
         with ThreadPoolExecutor(_REMOTE_THREADS) as pool:
             return list(pool.map(self._read_file, files))
 
-    def _read_file(self, file: Source) -> tuple[Source, dict[str, list[Row]], str]:
+    def _read_file(self, file: ResultSource) -> tuple[ResultSource, dict[str, list[Row]], str]:
         """Return the rows of a file, and why it has none."""
         try:
             if file.is_log:
@@ -342,7 +342,7 @@ class Catalog:
             facts = [LogFacts(damage=str(error))] if file.is_log else []
             return file, {"sessions": [self._session(file, fact) for fact in facts]}, str(error)
 
-    def _session(self, file: Source, facts: LogFacts) -> Row:
+    def _session(self, file: ResultSource, facts: LogFacts) -> Row:
         row = session_row(facts)
         head = split_part_path(Path(file.name))[0].as_posix() if row["part"] > 1 else file.name
         name = PurePosixPath(self._store.path(head)).stem  # as a session without an id calls itself
@@ -350,7 +350,7 @@ class Catalog:
             "size": file.size
         }
 
-    def _sweep(self, file: Source) -> dict[str, list[Row]]:
+    def _sweep(self, file: ResultSource) -> dict[str, list[Row]]:
         # The folder may come from anyone, and so may the checksum.
         table = self._store.read_table(file.name, SWEPT, tried=True)
         if table.num_rows > _MOST_SWEPT:
@@ -363,7 +363,7 @@ class Catalog:
             table_of(kind, row)
         return rows
 
-    def _result(self, file: Source) -> dict[str, list[Row]]:
+    def _result(self, file: ResultSource) -> dict[str, list[Row]]:
         if file.size > _MOST_RESULT:
             return {}
         value = read_json(self._store.read(file.name))

@@ -62,7 +62,7 @@ _ROUNDS = 2
 """How often each shape is found anew beside the others, which were found with fewer beside them."""
 
 
-class Kind(StrEnum):
+class DepartureKind(StrEnum):
     """Shape of a departure."""
 
     OUTLIER = "outlier"
@@ -87,7 +87,7 @@ class ChangePoint:
     """
 
     joint: int
-    kind: Kind
+    kind: DepartureKind
     session: int
     first: int
     last: int
@@ -98,7 +98,7 @@ class ChangePoint:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedQuantity:
     """A quantity of the joints of a robot over its sessions.
 
     Attributes:
@@ -167,7 +167,7 @@ class _Tail:
 
 def find_change_points(
     series: Sequence[FloatArray], times_s: FloatArray, conditions: IntArray
-) -> list[Judged]:
+) -> list[JudgedQuantity]:
     """Find joints whose series change, and sessions of a joint by themselves.
 
     Args:
@@ -184,7 +184,7 @@ def find_change_points(
     tested = [k for k, joints in enumerate(columns) if joints.size]
     rng = np.random.default_rng(0)
     noises = estimate_noise([series[k] for k in tested], conditions, rng)
-    judged = [Judged() for _ in series]
+    judged = [JudgedQuantity() for _ in series]
     for k, noise in zip(tested, noises, strict=True):
         families = 2 * len(tested)
         judged[k] = _judge(series[k], columns[k], noise, times_s, conditions, families=families)
@@ -205,7 +205,7 @@ def _judge(
     conditions: IntArray,
     *,
     families: int,
-) -> Judged:
+) -> JudgedQuantity:
     columns = columns[noise.scatter[columns] > 0]
     present = np.isfinite(values)
     shapes = {
@@ -213,7 +213,7 @@ def _judge(
         for rows in present[:, columns].T
     }
     if not any(of_joint.unit.any() for of_joint in shapes.values()):  # a condition a session
-        return Judged()
+        return JudgedQuantity()
     tails = _tails(noise, columns, present, conditions, shapes)
     points: list[ChangePoint] = []
     for column in columns.tolist():
@@ -222,11 +222,11 @@ def _judge(
         series = _Series(times_s, rows, conditions, noise.rho, values[rows, column], size)
         points += [replace(point, joint=column) for point in _search(series, tails, families)]
     longest = max(shapes.values(), key=lambda of_joint: of_joint.raw.shape[1])
-    middle = np.flatnonzero(longest.kinds == Kind.STEP)
+    middle = np.flatnonzero(longest.kinds == DepartureKind.STEP)
     middle = middle[np.argmax(longest.norm[middle])]
     needed = tails[False].threshold(LEVEL / families) + float(ndtri(_POWER))
     smallest = needed * float(np.median(noise.scatter[columns])) / longest.norm[middle]
-    return Judged(tuple(sorted(points, key=lambda point: -point.t)), noise, float(smallest))
+    return JudgedQuantity(tuple(sorted(points, key=lambda point: -point.t)), noise, float(smallest))
 
 
 def _shapes(
@@ -256,7 +256,11 @@ def _raw_shapes(times_s: FloatArray) -> tuple[IntArray, NDArray[np.str_], FloatA
     left_s = np.maximum(times_s[-1] - begin_s, np.finfo(float).tiny)
     since_s = times_s[None, :] - begin_s
     ramps = [np.clip(since_s / (part * left_s), 0.0, 1.0) for part in _PARTS]
-    counts = {Kind.OUTLIER: n, Kind.STEP: len(starts), Kind.GRADUAL: len(_PARTS) * len(starts)}
+    counts = {
+        DepartureKind.OUTLIER: n,
+        DepartureKind.STEP: len(starts),
+        DepartureKind.GRADUAL: len(_PARTS) * len(starts),
+    }
     return (
         np.concatenate([np.arange(n), np.tile(starts, 1 + len(_PARTS))]),
         np.repeat([str(kind) for kind in counts], list(counts.values())),
@@ -300,7 +304,9 @@ def _tails(
             for column in columns:
                 rows = present[:, column]
                 shapes = of_joints[rows.tobytes()]
-                chosen = shapes.unit[(shapes.kinds == Kind.OUTLIER) == outlier] @ shapes.white
+                chosen = (
+                    shapes.unit[(shapes.kinds == DepartureKind.OUTLIER) == outlier] @ shapes.white
+                )
                 fitted = np.abs(residuals[:, rows, column] @ chosen.T).max(axis=1)
                 np.maximum(t, fitted / size[:, column], out=t)
             largest[outlier].append(t)
@@ -346,8 +352,8 @@ def _search(series: _Series, tails: Mapping[bool, _Tail], families: int) -> list
         shapes, t = series.beside(chosen)
         tried = t.copy()
         for outlier, limit in limits.items():
-            t[((shapes.kinds == Kind.OUTLIER) == outlier) & (t < limit)] = 0.0
-        is_change = shapes.kinds != Kind.OUTLIER
+            t[((shapes.kinds == DepartureKind.OUTLIER) == outlier) & (t < limit)] = 0.0
+        is_change = shapes.kinds != DepartureKind.OUTLIER
         if t[is_change].any():  # a change isn't that of one session: most of it is left without
             farthest = int(np.where(is_change, 0.0, tried).argmax())
             t[is_change & (series.beside([*chosen, farthest])[1] < tails[False].start)] = 0.0
@@ -356,13 +362,13 @@ def _search(series: _Series, tails: Mapping[bool, _Tail], families: int) -> list
         chosen.append(int(t.argmax()))
     for k in [*range(len(chosen))] * _ROUNDS:
         shapes, t = series.beside([*chosen[:k], *chosen[k + 1 :]])
-        is_outlier = shapes.kinds == Kind.OUTLIER
+        is_outlier = shapes.kinds == DepartureKind.OUTLIER
         chosen[k] = int(np.where(is_outlier == is_outlier[chosen[k]], t, 0.0).argmax())
     rng = np.random.default_rng(0)
     points: list[ChangePoint] = []
     for k, index in enumerate(chosen):
         shapes, t = series.beside([*chosen[:k], *chosen[k + 1 :]])
-        p = families * tails[bool(shapes.kinds[index] == Kind.OUTLIER)].p(float(t[index]))
+        p = families * tails[bool(shapes.kinds[index] == DepartureKind.OUTLIER)].p(float(t[index]))
         if p <= LEVEL:
             points.append(replace(_fit(series, shapes, index, rng), t=float(t[index]), p=p))
     return points
@@ -378,7 +384,9 @@ def _fit(series: _Series, shapes: _Shapes, index: int, rng: np.random.Generator)
     # The likelihood ratio of the true shape, where there is such a change in such noise.
     drawn = noise[rng.integers(n, size=(n, _REFITS))]
     simulated = signal[:, None] + drawn - shapes.basis @ (shapes.basis.T @ drawn)
-    alike = (shapes.kinds == Kind.OUTLIER) == (shapes.kinds[index] == Kind.OUTLIER)
+    alike = (shapes.kinds == DepartureKind.OUTLIER) == (
+        shapes.kinds[index] == DepartureKind.OUTLIER
+    )
     left = np.where(alike, _left(residual[:, None], shapes)[:, 0], np.inf)
     left_simulated = np.where(alike[:, None], _left(simulated, shapes), np.inf)
     best = left_simulated.argmin(axis=0)
@@ -390,7 +398,7 @@ def _fit(series: _Series, shapes: _Shapes, index: int, rng: np.random.Generator)
     sessions = np.flatnonzero(series.rows)
     return ChangePoint(
         joint=-1,
-        kind=Kind(shapes.kinds[index]),
+        kind=DepartureKind(shapes.kinds[index]),
         session=int(sessions[shapes.starts[index]]),
         first=int(sessions[starts.min()]),
         last=int(sessions[starts.max()]),

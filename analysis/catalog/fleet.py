@@ -19,7 +19,13 @@ from undulog.capture.common.errors import MissingExtraError
 
 from ..estimators.intervals import holm
 from ..results.estimate import Interval
-from .change_points import LEAST_SESSIONS, ChangePoint, Judged, Kind, find_change_points
+from .change_points import (
+    LEAST_SESSIONS,
+    ChangePoint,
+    DepartureKind,
+    JudgedQuantity,
+    find_change_points,
+)
 from .earlier import DIFFERENCES, Departure, departure_sentence, departures, size_text
 from .joint_tables import Frame, by_session, conditions_of, values_of
 from .session_noise import relative_to_others
@@ -83,7 +89,7 @@ class JointChange:
 
 
 @dataclass(frozen=True)
-class Trend:
+class ResultTrend:
     """A monotonic trend of a result of sessions.
 
     Attributes:
@@ -177,7 +183,7 @@ class RobotHistory:
     last: str
     conditions: int
     changes: tuple[JointChange, ...]
-    trends: tuple[Trend, ...]
+    trends: tuple[ResultTrend, ...]
     components: tuple[Components, ...]
     outliers: tuple[Outlier, ...]
     memory: tuple[Memory, ...]
@@ -343,12 +349,14 @@ def _history(robot: str, serial: str, sessions: Frame, joints: Frame) -> RobotHi
         last=_date(ordered["start"].iloc[-1]),
         conditions=len(np.unique(conditions)),
         changes=tuple(
-            _change(*named, ordered) for named in points if named[2].kind is not Kind.OUTLIER
+            _change(*named, ordered)
+            for named in points
+            if named[2].kind is not DepartureKind.OUTLIER
         ),
         trends=tuple(_trends(ordered)),
         components=tuple(_components(name, table, conditions) for name, table in tables.items()),
         outliers=tuple(
-            _outlier(*named, ordered) for named in points if named[2].kind is Kind.OUTLIER
+            _outlier(*named, ordered) for named in points if named[2].kind is DepartureKind.OUTLIER
         ),
         memory=tuple(_memory(name, of, len(ordered)) for name, of in judged.items()),
         warnings=tuple(left_out),
@@ -367,7 +375,7 @@ def _change(quantity: str, joint: str, point: ChangePoint, sessions: Frame) -> J
         latest=_date(starts.iloc[point.last]),
         change=_as_change(quantity, point.change),
         change_ci95=(_as_change(quantity, low), _as_change(quantity, high)),
-        gradual=point.kind is Kind.GRADUAL,
+        gradual=point.kind is DepartureKind.GRADUAL,
         t=point.t,
         p=point.p,
     )
@@ -384,7 +392,7 @@ def _outlier(quantity: str, joint: str, point: ChangePoint, sessions: Frame) -> 
     )
 
 
-def _memory(quantity: str, judged: Judged, sessions: int) -> Memory:
+def _memory(quantity: str, judged: JudgedQuantity, sessions: int) -> Memory:
     """Return how much a quantity remembers, and what could be found in it."""
     if judged.noise is None:
         return Memory(quantity, None, None, None, max(LEAST_SESSIONS, sessions + 1))
@@ -406,11 +414,11 @@ def _date(start: Any) -> str:
     return pd.Timestamp(start).isoformat(timespec="seconds")
 
 
-def _trends(sessions: Frame) -> list[Trend]:
+def _trends(sessions: Frame) -> list[ResultTrend]:
     """Kendall's tau of each result against the date and each number that a sweep varied."""
     from scipy import stats  # takes half a second
 
-    trends: list[Trend] = []
+    trends: list[ResultTrend] = []
     for against, x in _covariates(sessions).items():
         for name in _TRENDS:
             y = sessions[name].to_numpy(float)
@@ -421,7 +429,7 @@ def _trends(sessions: Frame) -> list[Trend]:
             tau: Any = stats.kendalltau(x[known], y[known])
             slope: Any = stats.theilslopes(y[known], x[known], alpha=0.95)
             trends.append(
-                Trend(
+                ResultTrend(
                     name,
                     against,
                     float(slope.slope),

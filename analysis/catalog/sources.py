@@ -41,13 +41,13 @@ Scanned: TypeAlias = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Source(StoredFile):
+class ResultSource(StoredFile):
     """A file or a rosbag2 folder: a log, or what may hold results."""
 
     is_log: bool = False
 
 
-def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[Source]:
+def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[ResultSource]:
     """List logs and files that may hold results; none that is known and unchanged is opened.
 
     Args:
@@ -67,13 +67,13 @@ def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[Sourc
     files = store.files("", [".mcap", *_RESULTS], recursive=True)
     paths = ((file, PurePosixPath(file.name)) for file in files)
     return [
-        Source(file.name, file.size, file.modified_ns, path.suffix == ".mcap")
+        ResultSource(file.name, file.size, file.modified_ns, path.suffix == ".mcap")
         for file, path in paths
         if FOLDER not in path.parts and (path.suffix == ".mcap" or _may_be_result(path))
     ]
 
 
-def source_facts(store: ObjectStore, source: Source) -> LogFacts:
+def source_facts(store: ObjectStore, source: ResultSource) -> LogFacts:
     """Read the facts of a log from as few of its bytes as have them.
 
     Raises:
@@ -106,8 +106,8 @@ def _may_be_result(path: PurePath) -> bool:
     return folder not in ("pending", "settings") if path.suffix == ".json" else folder == "rows"
 
 
-def _local_results(base: Path) -> list[Source]:
-    sources: list[Source | None] = []
+def _local_results(base: Path) -> list[ResultSource]:
+    sources: list[ResultSource | None] = []
     for here, folders, files in walk(base):
         folders[:] = [name for name in folders if name != FOLDER]
         paths = (here / name for name in files if name.endswith(_RESULTS))
@@ -115,9 +115,9 @@ def _local_results(base: Path) -> list[Source]:
     return [each for each in sources if each is not None]
 
 
-def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
+def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[ResultSource]:
     """Return the logs of a folder, and each metadata.yaml there that is of another tool."""
-    others: list[Source] = []
+    others: list[ResultSource] = []
 
     def is_recording(folder: Path) -> bool:
         whole, own = _source(base, folder, is_log=True), _source(base, folder / METADATA)
@@ -135,11 +135,11 @@ def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
     return [*(log for log in logs if log is not None), *others]
 
 
-def _is_known(source: Source, known: Mapping[str, Scanned]) -> bool:
+def _is_known(source: ResultSource, known: Mapping[str, Scanned]) -> bool:
     return known.get(source.name, ())[:2] == (source.size, source.modified_ns)
 
 
-def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
+def _source(base: Path, path: Path, *, is_log: bool = False) -> ResultSource | None:
     """Return a file or folder; None if it was removed meanwhile.
 
     A session whose file is missing or empty has the size and time of its write-ahead log.
@@ -160,4 +160,4 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
     except FileNotFoundError:
         return None
     size, modified_ns = sum(each.st_size for each in own), max(each.st_mtime_ns for each in own)
-    return Source(name, size, modified_ns, is_log)
+    return ResultSource(name, size, modified_ns, is_log)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import Line, are_as_given, sessions_of
+from undulog.capture.commands.sessions import SessionLine, are_as_given, sessions_of
 from undulog.capture.commands.sessions import each as each_session
 from undulog.capture.commands.sessions import show as show_table
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
@@ -198,7 +198,7 @@ def _table(
 
 def _line(
     file: Path, *, options: Options, robot: str | None, found: list[Analysis] | None = None
-) -> Line:
+) -> SessionLine:
     from undulog.capture import Session
 
     from ..session.analyse import analyse_session
@@ -210,12 +210,12 @@ def _line(
     return line_of(analysis)
 
 
-def line_of(analysis: Analysis) -> Line:
+def line_of(analysis: Analysis) -> SessionLine:
     """Return the line of a session in a table."""
     from ..results import formats
 
     answer, known = analysis.answer, analysis.gait.frequency_hz.value is not None
-    return Line(
+    return SessionLine(
         robot=analysis.session.robot or "",
         gait=formats.gait_frequency(analysis.gait) if known else "",
         verdict=answer.verdict,

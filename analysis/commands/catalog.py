@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import (
     UNLIMITED,
-    Column,
+    TerminalColumn,
     complain,
     echo,
     emit_json,
@@ -136,7 +136,7 @@ def _print(rows: Any, names: tuple[str, ...] | None, report: ScanReport | None) 
         for row in rows.loc[:, list(names)].head(_SHOWN).itertuples(index=False)
     ]
     columns = [
-        Column(name, left=rows[name].dtype.kind not in "iuf", spare=_SPARE.get(name, 0))
+        TerminalColumn(name, left=rows[name].dtype.kind not in "iuf", spare=_SPARE.get(name, 0))
         for name in names
     ]
     lines, _ = table(columns, cells, width, cropped=width != UNLIMITED)

@@ -6,7 +6,14 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from undulog.capture.common.console import Column, echo, emit_json, output_width, progress, table
+from undulog.capture.common.console import (
+    TerminalColumn,
+    echo,
+    emit_json,
+    output_width,
+    progress,
+    table,
+)
 from undulog.capture.common.files import check_output, write_text
 
 if TYPE_CHECKING:
@@ -96,7 +103,7 @@ def print_table(result: EpisodesResult) -> None:
     echo(heading(result))
     rows = [[(cell, "") for cell in row] for row in rows_of(result)]
     if rows:
-        columns = [Column(title, left=title != "times the limit") for title in COLUMNS]
+        columns = [TerminalColumn(title, left=title != "times the limit") for title in COLUMNS]
         lines, _ = table(columns, rows, output_width(), cropped=True)
         echo(*(line.plain for line in lines))
     echo(*closing(result))

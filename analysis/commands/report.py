@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import FAILED, Line, are_as_given, sessions_of, show
+from undulog.capture.commands.sessions import FAILED, SessionLine, are_as_given, sessions_of, show
 from undulog.capture.commands.sessions import each as each_session
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
@@ -137,7 +137,7 @@ class _Page(NamedTuple):
     html: str
     facts: dict[str, Any]
     warnings: int = 0
-    lines: Mapping[str, Line] = {}
+    lines: Mapping[str, SessionLine] = {}
 
     @property
     def code(self) -> int:
@@ -277,7 +277,7 @@ def _pages(
     paths = list(dict.fromkeys(paths))
     pages = _page_names(paths)
 
-    def written(path: Path) -> Line:
+    def written(path: Path) -> SessionLine:
         page = folder / pages[path]
         refuse_existing(page, force=force)
         with _keeping(figures) as drawn:
@@ -345,7 +345,7 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
 
     page = SessionsPage()
 
-    def added(path: Path) -> Line:
+    def added(path: Path) -> SessionLine:
         page.check_size()
         with Session.open(path, robot=robot) as session:
             measured = measure_session(session, options)

@@ -38,7 +38,7 @@ from .decisions import (
     family,
     moved_offsets,
 )
-from .quantities import Motion, Quantities, common_motion, motion_estimates
+from .quantities import PeriodicMotion, Quantities, common_motion, motion_estimates
 from .side import ComparedSession, changes, one_robot, phases_rad, see, turned
 from .tracking import at_one_command, commands_differ, fastest_rad_s
 
@@ -392,7 +392,7 @@ def _align_motions(
     Raises:
         DataError: If a session has no periodic motion, or no joint moves in all of them.
     """
-    motions: list[Motion] = []
+    motions: list[PeriodicMotion] = []
     for one in (*a, *b):
         if one.motion is None:
             raise DataError(

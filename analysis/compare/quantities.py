@@ -152,7 +152,7 @@ def paired(a: FloatArray, b: FloatArray) -> Differences:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PeriodicMotion:
     """The periodic motion of one session.
 
     Attributes:
@@ -182,7 +182,7 @@ class Motion:
         return float(np.angle(self.oscillation.amplitudes[self.names.index(joint)]))
 
 
-def motion_of(label: str, robot: Robot | None, fitted: MotionFit) -> Motion:
+def motion_of(label: str, robot: Robot | None, fitted: MotionFit) -> PeriodicMotion:
     """Return what is compared of a fitted motion.
 
     Args:
@@ -190,7 +190,9 @@ def motion_of(label: str, robot: Robot | None, fitted: MotionFit) -> Motion:
     """
     relative = fitted.oscillation.omega_variance / fitted.fit.omega**2
     log_frequency = float(np.log(fitted.fit.frequency_hz)), relative, fitted.omega_dof
-    return Motion(label, robot, fitted.names, fitted.oscillation, fitted.chain, log_frequency)
+    return PeriodicMotion(
+        label, robot, fitted.names, fitted.oscillation, fitted.chain, log_frequency
+    )
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ class CommonMotion:
     before: Mapping[str, str]
 
 
-def common_motion(motions: Sequence[Motion]) -> CommonMotion:
+def common_motion(motions: Sequence[PeriodicMotion]) -> CommonMotion:
     """Find the joints that can be compared.
 
     Args:
@@ -272,7 +274,7 @@ def common_motion(motions: Sequence[Motion]) -> CommonMotion:
     )
 
 
-def motion_estimates(motion: Motion, common: CommonMotion) -> dict[Key, Known]:
+def motion_estimates(motion: PeriodicMotion, common: CommonMotion) -> dict[Key, Known]:
     """Return the quantities of a motion that are compared.
 
     Returns:
@@ -305,12 +307,12 @@ def motion_estimates(motion: Motion, common: CommonMotion) -> dict[Key, Known]:
     return found
 
 
-def _select(motion: Motion, names: Sequence[str]) -> Oscillation:
+def _select(motion: PeriodicMotion, names: Sequence[str]) -> Oscillation:
     index = np.array([motion.names.index(name) for name in names], dtype=np.int64)
     return motion.oscillation.select(index)
 
 
-def _some(motion: Motion) -> str:
+def _some(motion: PeriodicMotion) -> str:
     moving = [name for name in motion.names if name in motion.phased]
     return (
         f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''} do" if moving else "none do"

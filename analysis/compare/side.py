@@ -26,13 +26,13 @@ from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.analysis import Analysis
-from ..results.comparison import BODY, Change
+from ..results.comparison import BODY, MetadataChange
 from ..session.analyse import measure_session
 from ..session.fields import SessionMeasurement
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span
-from .quantities import Key, Known, Motion, Quantities, from_runs, motion_of
+from .quantities import Key, Known, PeriodicMotion, Quantities, from_runs, motion_of
 from .tracking import MeanCommand, mean_commands, offset_estimates, tracking_estimates
 
 PHASES = 72
@@ -143,7 +143,9 @@ def one_robot(facts: Sequence[Mapping[str, str]]) -> bool:
     return all(len({fact[key] for fact in facts if fact.get(key)}) <= 1 for key in keys)
 
 
-def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
+def changes(
+    a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]
+) -> tuple[MetadataChange, ...]:
     """List the facts that differ between the sides.
 
     Args:
@@ -156,7 +158,7 @@ def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> t
     """
     names = list(dict.fromkeys(name for facts in (*a, *b) for name in facts))
     found = [
-        Change(name, *sides)
+        MetadataChange(name, *sides)
         for name in names
         if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
     ]
@@ -213,7 +215,7 @@ class ComparedSession:
     estimates: Mapping[Key, Known]
     cycles: Mapping[str, Quantities]
     offsets: Mapping[str, float]
-    motion: Motion | None = None
+    motion: PeriodicMotion | None = None
     commands: Mapping[str, MeanCommand] = field(default_factory=dict[str, MeanCommand])
 
     @property

@@ -12,11 +12,11 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
 from ..estimators.series import Series, clean_together, shared_times
 from ..response.fitting import GaitFit
-from ..results.answer import EITHER, PLAY, STICK, DeadBand, Reversal
+from ..results.answer import EITHER, PLAY, STICK, DeadBand, DeadBandEnd
 from ..signals.columns import Columns
 from ..signals.scales import resolution_of, runs
-from .fit import Fitted, fit_dead_bands
-from .model import BOTTOM, DELAY, TOP, WIDTH, Cycles, whole_cycles
+from .fit import FittedBand, fit_dead_bands
+from .model import BOTTOM, DELAY, TOP, WIDTH, WholeCycles, whole_cycles
 
 _RAMP = 0.5
 """Change of the effort over a plateau that is a ramp, as a share of the effort in motion."""
@@ -87,7 +87,7 @@ class Witness:
         return cls(found.get(quantity), quantity, found.get("reference"))
 
 
-def decide(cycles: Cycles, joint: int, one: Fitted, witness: Witness) -> tuple[str, str]:
+def decide(cycles: WholeCycles, joint: int, one: FittedBand, witness: Witness) -> tuple[str, str]:
     """Tell stick from play, if the data do.
 
     A motor that dry friction holds pulls ever harder, from one direction to the other, while the
@@ -229,7 +229,7 @@ def dead_bands(
 
 
 def _of_group(
-    names: Sequence[str], cycles: Cycles, omega: float, columns: Columns, origin_ns: int
+    names: Sequence[str], cycles: WholeCycles, omega: float, columns: Columns, origin_ns: int
 ) -> dict[str, DeadBand]:
     wave, ratio = _fundamentals(cycles, omega)
     amplitude, lag = np.abs(wave), -np.angle(ratio) % (2 * np.pi)
@@ -245,7 +245,7 @@ def _of_group(
     if chosen.size == 0:
         return {}
     some = tuple(cycles.commands[j] for j in chosen)
-    part = Cycles(some, cycles.t_s, cycles.first, cycles.measured[chosen])
+    part = WholeCycles(some, cycles.t_s, cycles.first, cycles.measured[chosen])
     fits = fit_dead_bands(part, omega, amplitude[chosen], lag[chosen], resolution[chosen])
     bands: dict[str, DeadBand] = {}
     for k, (j, one) in enumerate(zip(chosen.tolist(), fits, strict=True)):
@@ -263,7 +263,7 @@ def _of_group(
     return bands
 
 
-def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
+def _fundamentals(cycles: WholeCycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
     """Return the amplitudes of the commands, and of the positions over them."""
     back = np.exp(1j * omega * cycles.t_s[:, cycles.first :])
     waves: list[complex] = []
@@ -278,7 +278,9 @@ def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexAr
     return np.array(waves), np.array(ratios)
 
 
-def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[float, float, float]:
+def _without(
+    cycles: WholeCycles, joint: int, lag: float, omega: float
+) -> tuple[float, float, float]:
     """Misfit without a dead band [rad^2], the width that the loop hints at [rad], what to gain.
 
     Position = offset + gain c + damping c' is exact for a linear joint and a sine; a dead band adds
@@ -309,7 +311,7 @@ def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[floa
 
 
 def _rests(
-    cycles: Cycles, joint: int, fitted: Fitted, resolution: float
+    cycles: WholeCycles, joint: int, fitted: FittedBand, resolution: float
 ) -> tuple[float, float] | None:
     """For how long the joint rests after top and bottom [s]; None unless it does at both."""
     begin = cycles.first // 2  # by then the model has its state
@@ -345,7 +347,7 @@ def _rests(
 
 
 def _result(
-    fitted: Fitted,
+    fitted: FittedBand,
     command: Series,
     rest_s: tuple[float, float],
     omega: float,
@@ -357,7 +359,7 @@ def _result(
     followed = rested(command.values, width, top, bottom)
     change = fundamental_change(command.t_s, command.values, followed, omega)
     sides = [
-        Reversal(
+        DeadBandEnd(
             travel_rad=float(travel[0]),
             travel_ci95=(float(travel[1]), float(travel[2])),
             step_rad=fitted.gain * float(step[0]),

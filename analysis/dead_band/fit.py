@@ -16,7 +16,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.intervals import t_factor
-from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
+from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, BandMisfit, WholeCycles, misfit
 
 _SHARES = np.array([0.0, 0.15, 0.4, 1.0])
 """b over w along the profile."""
@@ -52,7 +52,7 @@ _TIES = (np.eye(PARAMETERS)[:, :3], np.vstack((np.eye(4), np.eye(4)[3:])), np.ey
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedBand:
     """One joint's fit.
 
     Attributes:
@@ -76,8 +76,12 @@ class Fitted:
 
 
 def fit_dead_bands(
-    cycles: Cycles, omega: float, amplitude: FloatArray, lag: FloatArray, resolution: FloatArray
-) -> list[Fitted]:
+    cycles: WholeCycles,
+    omega: float,
+    amplitude: FloatArray,
+    lag: FloatArray,
+    resolution: FloatArray,
+) -> list[FittedBand]:
     """Fit the model to some joints, all in step.
 
     Args:
@@ -143,14 +147,14 @@ class _Candidates(NamedTuple):
 
 
 def _chosen(
-    cycles: Cycles,
+    cycles: WholeCycles,
     joint: int,
     candidates: _Candidates,
     scales: _Scales,
     *,
-    lefts: Sequence[Misfit],
+    lefts: Sequence[BandMisfit],
     moved: FloatArray,
-) -> Fitted:
+) -> FittedBand:
     """Return the simplest model that none explains more than, with its intervals.
 
     Args:
@@ -181,7 +185,7 @@ def _chosen(
         travel[:, 1] = np.minimum(travel[:, 1], low - error[:2])
         travel[:, 2] = np.maximum(travel[:, 2], high + error[:2])
         step[:, 2] = np.maximum(step[:, 2], most)
-    return Fitted(
+    return FittedBand(
         parameters=chosen,
         gain=float(left.gain[0]),
         travel=np.maximum(travel, 0.0),
@@ -228,7 +232,7 @@ def _starts(period_s: float, omega: float, amplitude: FloatArray, lag: FloatArra
 
 
 def _levenberg(
-    cycles: Cycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
+    cycles: WholeCycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
 ) -> FloatArray:
     """Levenberg-Marquardt steps on rows of parameters ``ties @ values`` with bounds, in step."""
     rows, n = values.shape
@@ -278,7 +282,7 @@ def _levenberg(
 
 
 def _slopes(
-    cycles: Cycles,
+    cycles: WholeCycles,
     joint: IntArray,
     values: FloatArray,
     ties: FloatArray,
@@ -343,7 +347,7 @@ def _free(fitted: _Candidate, scales: _Scales) -> IntArray:
 
 
 def _moved(
-    cycles: Cycles, joints: Sequence[int], fits: Sequence[_Candidate], scales: _Scales
+    cycles: WholeCycles, joints: Sequence[int], fits: Sequence[_Candidate], scales: _Scales
 ) -> list[FloatArray]:
     """Return the followers of each joint with each of its free parameters nudged [rad]."""
     free = [_free(fit, scales) for fit in fits]
@@ -360,11 +364,11 @@ def _moved(
 
 
 def _errors(
-    cycles: Cycles,
+    cycles: WholeCycles,
     joint: int,
     fitted: _Candidate,
     scales: _Scales,
-    one: Misfit,
+    one: BandMisfit,
     *,
     nudged: FloatArray,
 ) -> FloatArray:

@@ -117,7 +117,7 @@ def _low_pass(u: FloatArray, step_s: FloatArray, lag: FloatArray) -> tuple[Float
 
 
 @dataclass(frozen=True)
-class Cycles:
+class WholeCycles:
     """Whole cycles of some joints that share their sampling times.
 
     Attributes:
@@ -141,10 +141,10 @@ class Cycles:
         """Time since the sample before [s], shape (k, n)."""
         return np.diff(self.t_s, axis=1, prepend=2 * self.t_s[:, :1] - self.t_s[:, 1:2])
 
-    def some(self, count: int) -> Cycles:
+    def some(self, count: int) -> WholeCycles:
         """Fewer of the windows, evenly spread."""
         kept = _spread(np.arange(len(self.t_s)), count)
-        return Cycles(self.commands, self.t_s[kept], self.first, self.measured[:, kept])
+        return WholeCycles(self.commands, self.t_s[kept], self.first, self.measured[:, kept])
 
     def commanded(self, joint: int, delay_s: float = 0.0) -> FloatArray:
         """A joint's command at all times.
@@ -160,7 +160,7 @@ class Cycles:
 
 def whole_cycles(
     commands: Sequence[Series], responses: Sequence[Series], omega: float, most: int
-) -> Cycles | None:
+) -> WholeCycles | None:
     """Cut the motion of some joints into cycles.
 
     Args:
@@ -183,11 +183,11 @@ def whole_cycles(
     stride = -(-count // _MOST_SAMPLES)
     index = starts[:, np.newaxis] + np.arange(0, first + count, stride)
     measured = np.stack([response.values[index] for response in responses])
-    return Cycles(tuple(commands), t_s[index], -(-first // stride), measured)
+    return WholeCycles(tuple(commands), t_s[index], -(-first // stride), measured)
 
 
 @dataclass(frozen=True)
-class Misfit:
+class BandMisfit:
     """What the model leaves over.
 
     Attributes:
@@ -207,13 +207,13 @@ class Misfit:
         """Sum of squares [rad^2], shape (r,)."""
         return np.square(self.residual).sum(axis=(1, 2))
 
-    def row(self, index: int) -> Misfit:
+    def row(self, index: int) -> BandMisfit:
         """Return one of the rows, alone."""
         own = slice(index, index + 1)
-        return Misfit(self.residual[own], self.gain[own], self.follower[own], self.rests[own])
+        return BandMisfit(self.residual[own], self.gain[own], self.follower[own], self.rests[own])
 
 
-def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
+def misfit(cycles: WholeCycles, joint: IntArray, parameters: FloatArray) -> BandMisfit:
     """Hold the model against what was measured; gain and offset are fitted.
 
     Args:
@@ -233,7 +233,7 @@ def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
     square = np.square(own).sum(axis=(1, 2))
     product = (own * seen).sum(axis=(1, 2))
     gain = np.divide(product, square, out=np.zeros_like(square), where=square > 0)
-    return Misfit(seen - gain[:, np.newaxis, np.newaxis] * own, gain, z, rests)
+    return BandMisfit(seen - gain[:, np.newaxis, np.newaxis] * own, gain, z, rests)
 
 
 def _spread(index: IntArray, most: int) -> IntArray:

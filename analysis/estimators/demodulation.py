@@ -164,7 +164,7 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
 
 
 @dataclass(frozen=True)
-class Phase:
+class LoggedPhase:
     """The logged phase of a plane or joint over one run, always increasing.
 
     Attributes:
@@ -201,7 +201,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Cycles:
+class CycleResponses:
     """Response to the command in each cycle of one joint.
 
     Attributes:
@@ -220,14 +220,15 @@ class Cycles:
 
 
 def demodulate(
-    command: Series, response: Series, phase: Phase, edges_s: FloatArray
+    command: Series, response: Series, phase: LoggedPhase, edges_s: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Complex amplitudes of command and response in each cycle of a run.
 
     Args:
         response: Its responses, on their own times.
         phase: Its phase over the run.
-        edges_s: Edges of the cycles [s], shape (c + 1,), from :meth:`Phase.edges_s` of its plane.
+        edges_s: Edges of the cycles [s], shape (c + 1,), from :meth:`LoggedPhase.edges_s` of its
+            plane.
 
     Returns:
         Amplitudes relative to exp(j Phi), NaN where a cycle has too few samples or a gap, or where
@@ -245,7 +246,7 @@ def cycles_of(
     given: Sequence[ComplexArray],
     *,
     settled_s: float = -np.inf,
-) -> Cycles:
+) -> CycleResponses:
     """Return the response in each cycle of all runs, with its noise.
 
     Args:
@@ -285,7 +286,7 @@ def cycles_of(
         variance = np.divide(known.mean() / 2, answer, out=variance, where=answer > 0)
         dof = _difference_dof(known.size)
     starts, stops = ([edge[:-1] for edge in edges], [edge[1:] for edge in edges])
-    return Cycles(np.concatenate(starts), np.concatenate(stops), ratio, variance, dof)
+    return CycleResponses(np.concatenate(starts), np.concatenate(stops), ratio, variance, dof)
 
 
 def _difference_dof(count: int) -> float:
@@ -299,7 +300,7 @@ def _difference_dof(count: int) -> float:
 
 
 def _amplitudes(
-    series: Series, phase: Phase, edges_s: FloatArray
+    series: Series, phase: LoggedPhase, edges_s: FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
     """Return the fundamental in each cycle, and its power as a share of all; each (c,)."""
     count = edges_s.size - 1

@@ -28,17 +28,17 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ..response.excitation import Kind
+from ..response.excitation import ExcitationKind
 from ..response.frequency_response import joint_response, sound_lines
 from ..response.nonparametric import LineResponse, line_power, noise_power
 from ..results import formats
 from ..results.estimate import Estimate
 from ..results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
-from .distortion_spread import DistortionSpread, Spread, distortion_spread
+from .distortion_spread import DistortionSpread, LevelSpread, distortion_spread
 from .multisine_runs import MultisineRun
 from .sweep_runs import MOST_CONDITION
 
-NO_SPREAD, NO_SPREADS = Spread(), DistortionSpread()
+NO_SPREAD, NO_SPREADS = LevelSpread(), DistortionSpread()
 
 IMPURE = 0.01
 """Share of the commands at lines that the plan leaves out from which a warning is given."""
@@ -190,7 +190,7 @@ def _joint(
     if not lines.frequency_hz.size:
         return None
     kept = np.isin(frequency_hz, lines.frequency_hz)
-    response = joint_response(joint, str(Kind.PERIODIC), sharing, lines)
+    response = joint_response(joint, str(ExcitationKind.PERIODIC), sharing, lines)
     separable = approximation.relative_distortion.value is not None
     return BestLinearJoint(
         response=replace(response, distortion=approximation.relative_distortion.value),
@@ -328,7 +328,7 @@ def realisation_response(
 
 
 def over_realisations(
-    values: ComplexArray, noises: FloatArray, spread: Spread = NO_SPREAD
+    values: ComplexArray, noises: FloatArray, spread: LevelSpread = NO_SPREAD
 ) -> BestLinearApproximation:
     """Combine the responses of the realisations.
 
@@ -364,7 +364,7 @@ def over_realisations(
 
 
 def root_of_mean(
-    squares: FloatArray, least_sd: float = 0.0, spread: Spread = NO_SPREAD
+    squares: FloatArray, least_sd: float = 0.0, spread: LevelSpread = NO_SPREAD
 ) -> Estimate:
     """Return the root of a mean square with its interval, by Student's t and a known spread.
 
@@ -421,7 +421,7 @@ def detection_lines(
     excited = float(power[:, lines].mean())
     free = np.setdiff1d(np.arange(int(lines[0]), int(lines[-1])), lines)
 
-    def level(parity: int, least: Spread) -> Estimate:
+    def level(parity: int, least: LevelSpread) -> Estimate:
         chosen = power[:, free[free % 2 == parity]]
         if not chosen.size or not excited > 0:
             return Estimate()

@@ -32,7 +32,7 @@ ROUNDING = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True)
-class Spread:
+class LevelSpread:
     """Ends of the central 95 % of a level's square over its expectation; 1 is no spread.
 
     Attributes:
@@ -48,9 +48,9 @@ class Spread:
 class DistortionSpread:
     """Of the distortion at the excited lines, and at odd and even lines that are left out."""
 
-    excited: Spread = Spread()
-    odd: Spread = Spread()
-    even: Spread = Spread()
+    excited: LevelSpread = LevelSpread()
+    odd: LevelSpread = LevelSpread()
+    even: LevelSpread = LevelSpread()
 
 
 def distortion_spread(
@@ -80,10 +80,10 @@ def distortion_spread(
     )
 
 
-def _of_responses(responses: ComplexArray, chosen: IntArray) -> Spread:
+def _of_responses(responses: ComplexArray, chosen: IntArray) -> LevelSpread:
     """Return the spread of the scatter of responses about their mean; of one there is none."""
     if chosen.shape[1] < 2:
-        return Spread()
+        return LevelSpread()
     off = responses - responses.mean(axis=0)
     gram = np.real(off @ off.conj().T)
     squares = np.diag(gram)
@@ -92,20 +92,20 @@ def _of_responses(responses: ComplexArray, chosen: IntArray) -> Spread:
     across = gram[chosen[:, :, None], chosen[:, None, :]].sum(axis=(1, 2)) / count
     expected = float(squares.mean())
     if expected <= ROUNDING * float(np.mean(np.abs(responses) ** 2)):
-        return Spread()
+        return LevelSpread()
     return _quantiles((total - across) / (count - 1), expected)
 
 
-def _of_powers(spectra: ComplexArray, chosen: IntArray) -> Spread:
+def _of_powers(spectra: ComplexArray, chosen: IntArray) -> LevelSpread:
     if not spectra.shape[1]:
-        return Spread()
+        return LevelSpread()
     power = np.sum(np.abs(spectra) ** 2, axis=1)
     return _quantiles(power[chosen].mean(axis=1), float(power.mean()))
 
 
-def _quantiles(draws: FloatArray, expected: float) -> Spread:
+def _quantiles(draws: FloatArray, expected: float) -> LevelSpread:
     ends = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
     if not expected > 0:
-        return Spread()
+        return LevelSpread()
     low, high = (np.quantile(draws, ends) / expected).tolist()
-    return Spread(min(low, 1.0), max(high, 1.0))
+    return LevelSpread(min(low, 1.0), max(high, 1.0))

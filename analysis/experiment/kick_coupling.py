@@ -32,7 +32,7 @@ from ..results.coupling import (
     rows_of,
 )
 from ..results.estimate import Estimate
-from .kick_runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
+from .kick_runs import MOST_KICK, Kick, KickExperiment, KickKind, missing_kicks
 from .local_coupling import (
     LocalMatrices,
     ResponseMatrices,
@@ -63,10 +63,10 @@ def kick_size(
     """
     sizes = {
         kind: [abs(kick.size) for kick in kicks if kick is not None and kick.kind is kind]
-        for kind in Kind
+        for kind in KickKind
     }
-    phase = float(np.mean(sizes[Kind.PHASE]))
-    amplitude = float(np.mean(sizes[Kind.AMPLITUDE])) if sizes[Kind.AMPLITUDE] else None
+    phase = float(np.mean(sizes[KickKind.PHASE]))
+    amplitude = float(np.mean(sizes[KickKind.AMPLITUDE])) if sizes[KickKind.AMPLITUDE] else None
     m = len(matrices.P.value)
     resolved = float(np.median(matrices.P.half_together[~np.eye(m, dtype=bool)]))
     curvature = _curvature(kicks, answers, matrices)
@@ -118,7 +118,7 @@ def _curvature(
     base = [k for k, kick in enumerate(kicks) if kick is None]
     middle = answers.log[base].mean(axis=0)
     even = odd = noise = 0.0
-    for up, down in sides(kicks, Kind.PHASE).values():
+    for up, down in sides(kicks, KickKind.PHASE).values():
         high, low = answers.log[up].mean(axis=0), answers.log[down].mean(axis=0)
         even += float(np.sum(np.abs((high + low) / 2 - middle) ** 2))
         odd += float(np.sum(np.abs(high - low) ** 2)) / 4
@@ -196,7 +196,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
             "matrices are missing",
             record=plan,
         )
-    if lacking := missing_kicks(list(kicks.values()), Kind.PHASE, experiment.names):
+    if lacking := missing_kicks(list(kicks.values()), KickKind.PHASE, experiment.names):
         return Coupling(
             identifiable=False,
             why="central differences need each joint's phase kicked both up and down by the same "
@@ -269,7 +269,9 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
 
 def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
     """Return whether S and G can be estimated; warn of amplitudes not kicked both ways."""
-    lacking = missing_kicks(list(experiment.runs.kicks.values()), Kind.AMPLITUDE, experiment.names)
+    lacking = missing_kicks(
+        list(experiment.runs.kicks.values()), KickKind.AMPLITUDE, experiment.names
+    )
     if lacking:
         warn(
             "G, S and the nonlinearity are null: they need each joint's amplitude kicked both up "

@@ -34,7 +34,7 @@ LOPSIDED = 0.1
 """Kicks up and down may differ by this share of their span: what differs leaves curvature in."""
 
 
-class Kind(StrEnum):
+class KickKind(StrEnum):
     """What of a command is kicked."""
 
     PHASE = "phase"
@@ -50,7 +50,7 @@ class Kick:
     """
 
     joint: int
-    kind: Kind
+    kind: KickKind
     size: float
 
 
@@ -109,7 +109,7 @@ def kick_of(deviation: ComplexArray, same: float = SAME, most: float = MOST_KICK
     size = float(parts[part, joint])
     if abs(size) > most:
         return None
-    return Kick(joint, (Kind.PHASE, Kind.AMPLITUDE)[part], size)
+    return Kick(joint, (KickKind.PHASE, KickKind.AMPLITUDE)[part], size)
 
 
 def sort_kicks(command: ComplexArray) -> KickedRuns | None:
@@ -155,7 +155,7 @@ def sort_kicks_within(command: ComplexArray, same: float, most: float) -> Kicked
     return best if len(different) > 1 else None
 
 
-def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tuple[str, ...]:
+def missing_kicks(kicks: Sequence[Kick], kind: KickKind, names: Sequence[str]) -> tuple[str, ...]:
     """List the kicks that are missing for central differences.
 
     Args:

@@ -49,7 +49,7 @@ from ..estimators.intervals import (
 )
 from ..results.coupling import LTI_LABEL, Lti, rows_of
 from ..results.estimate import Estimate
-from .kick_runs import Kick, Kind
+from .kick_runs import Kick, KickKind
 from .run_scatter import RunErrors, run_errors, sides
 
 BANDS = (1, 2, 3)
@@ -90,7 +90,7 @@ class ResponseMatrices:
 
 
 def central_differences(
-    kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
+    kicks: Sequence[Kick], answers: ResponseMatrices, kind: KickKind
 ) -> tuple[NoisyMatrix, NoisyMatrix]:
     """Return derivatives of phase and of log amplitude with respect to one kind of kick.
 
@@ -313,24 +313,24 @@ def local_matrices(
     used = [kick for kick in kicks if kick is not None]
     of_kicks = answers.select(kicked)
 
-    def differences(errors: RunErrors | None, kind: Kind) -> tuple[NoisyMatrix, NoisyMatrix]:
+    def differences(errors: RunErrors | None, kind: KickKind) -> tuple[NoisyMatrix, NoisyMatrix]:
         return central_differences(used, replace(of_kicks, errors=errors), kind)
 
-    phase, log_gain = differences(None, Kind.PHASE)
+    phase, log_gain = differences(None, KickKind.PHASE)
     derivatives = ((phase.value - 1j * log_gain.value).astype(np.complex128), None)
     if amplitude:
-        phase, log_gain = differences(None, Kind.AMPLITUDE)
+        phase, log_gain = differences(None, KickKind.AMPLITUDE)
         derivatives = (derivatives[0], (log_gain.value + 1j * phase.value).astype(np.complex128))
     variance = np.hstack([answers.phase_variance, answers.log_gain_variance])
     without, errors, steady = (
         run_errors(kicks, answers.log, variance, derivatives, pairs=pairs, rows=rows)
         for pairs, rows in ((True, False), (True, True), (False, True))
     )
-    sums = [row_sums(difference) for difference in differences(without, Kind.PHASE)]
+    sums = [row_sums(difference) for difference in differences(without, KickKind.PHASE)]
     agree = np.stack([_agree(total, to) for total, to in zip(sums, (1.0, 0.0), strict=True)])
     widened = np.stack(list(map(_widening, sums, (1.0, 0.0), agree)))
-    P, R = _widen(differences(errors, Kind.PHASE), widened)
-    S, G = _widen(differences(errors, Kind.AMPLITUDE), widened) if amplitude else (None, None)
+    P, R = _widen(differences(errors, KickKind.PHASE), widened)
+    S, G = _widen(differences(errors, KickKind.AMPLITUDE), widened) if amplitude else (None, None)
     return LocalMatrices(P, R, G, S, errors, steady, sums[0], sums[1], agree, widened)
 
 

@@ -14,7 +14,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.series import Series
-from ..response.excitation import REPEATED, Kind, find_excitation
+from ..response.excitation import REPEATED, ExcitationKind, find_excitation
 from ..response.frequency_response import SAME_COMMAND
 from ..response.nonparametric import excited_lines, resampled
 from ..response.rhythm import DRIVEN_SHARE
@@ -210,7 +210,7 @@ def _commanded_design(driven: Mapping[str, Series]) -> MultisineDesign | None:
     """Find period and lines of a session without a plan, by its first driven joint."""
     command = next(iter(driven.values()), None)
     excitation = None if command is None else find_excitation(command)
-    if command is None or excitation is None or excitation.kind is not Kind.PERIODIC:
+    if command is None or excitation is None or excitation.kind is not ExcitationKind.PERIODIC:
         return None
     period_s = excitation.period_s
     if not period_s < LONGEST_PERIOD_S:

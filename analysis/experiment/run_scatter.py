@@ -27,7 +27,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from .kick_runs import Kick, Kind
+from .kick_runs import Kick, KickKind
 
 _ZERO = 1e-9
 """A combination of runs that is shorter, once those before it are taken off, is one of them."""
@@ -97,7 +97,7 @@ def run_errors(
     values = np.hstack([log.imag, log.real])
     foreseen = _foreseen(kicks, log.shape[1], derivatives)
     even = _orthonormal(_repeats(kicks, values) + (_pairs(kicks) if pairs else []), len(kicks))
-    left_out = sum(bool(sides(kicks, kind)) for kind in Kind) if pairs else 0
+    left_out = sum(bool(sides(kicks, kind)) for kind in KickKind) if pairs else 0
     level = values - np.hstack([foreseen.imag, foreseen.real])
     draws = even @ (_without_own(kicks, level) if pairs else level)
     if rows:
@@ -119,7 +119,7 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
     """
     m = values.shape[1] // 2
     adjusted = values.copy()
-    for kind in Kind:
+    for kind in KickKind:
         pairs = sides(kicks, kind)
         if len(pairs) < 2:
             continue
@@ -136,7 +136,7 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
 
 def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:
     weights = np.zeros(len(kicks))
-    for up, down in sides(kicks, Kind.PHASE).values():
+    for up, down in sides(kicks, KickKind.PHASE).values():
         span = _mean_size(kicks, up) - _mean_size(kicks, down)
         weights[up] += 1 / (len(up) * span)
         weights[down] -= 1 / (len(down) * span)
@@ -152,7 +152,7 @@ def _foreseen(
     for k, kick in enumerate(kicks):
         if kick is None:
             continue
-        phase = kick.kind is Kind.PHASE
+        phase = kick.kind is KickKind.PHASE
         L = of_phase if phase else of_amplitude
         if L is not None:
             foreseen[k] = np.log1p(L[:, kick.joint] * np.expm1(kick.size * (1j if phase else 1.0)))
@@ -161,7 +161,7 @@ def _foreseen(
 
 def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArray]:
     """Compare each run with the mean of all runs of its commands; copied files don't count."""
-    groups: dict[tuple[int, Kind, bool] | None, list[int]] = {}
+    groups: dict[tuple[int, KickKind, bool] | None, list[int]] = {}
     seen: set[bytes] = set()
     for k, kick in enumerate(kicks):
         numbers = values[k].tobytes()
@@ -179,7 +179,7 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
 def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     """Compare kicks up and down together with the mean of all of them, for each kind."""
     contrasts: list[FloatArray] = []
-    for kind in Kind:
+    for kind in KickKind:
         pairs: list[FloatArray] = []
         for up, down in sides(kicks, kind).values():
             row = np.zeros(len(kicks))
@@ -191,7 +191,7 @@ def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     return contrasts
 
 
-def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int], list[int]]]:
+def sides(kicks: Sequence[Kick | None], kind: KickKind) -> dict[int, tuple[list[int], list[int]]]:
     """Return the runs that kick a joint up and those that kick it down.
 
     Args:

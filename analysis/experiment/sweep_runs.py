@@ -19,7 +19,7 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, I
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
-from undulog.capture.robot.run import Run
+from undulog.capture.robot.run import TwinRun
 
 from ..estimators.series import Series, clean
 from ..response.changes import DRIFT_PER_CYCLE
@@ -219,7 +219,7 @@ class SweepData:
     contact: bool | None
     drift: float
     robot: Robot | None
-    run: Run | None
+    run: TwinRun | None
 
 
 def sweep_data(
@@ -234,7 +234,7 @@ def sweep_data(
     Raises:
         DataError: If a driven joint's response is missing in a run, or too short.
     """
-    twins: list[Run | None] = []
+    twins: list[TwinRun | None] = []
     robot: Robot | None = None
     omega: list[FloatArray] = []
     commands: list[ComplexArray] = []

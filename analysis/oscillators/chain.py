@@ -23,9 +23,9 @@ from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..results.answer import Note, beyond, percent
 from ..results.estimate import Estimate, leaves_out_zero
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
-from ..results.oscillators import ChainCoupling, Link, Rate
+from ..results.oscillators import ChainCoupling, OscillatorLink, Rate
 from ..signals.stretch import GAIT_TOPIC, Options
-from .weak_form import OscillatorFit, Piece, fit_oscillator, read_phases, window_length
+from .weak_form import KickInterval, OscillatorFit, fit_oscillator, read_phases, window_length
 
 LEAST_KICK = 0.1
 """A phase that jumps by less between two samples, against those beside them, isn't kicked [rad]."""
@@ -79,7 +79,7 @@ def kicked_steps(phases: FloatArray) -> BoolArray:
 
 def between_kicks(
     phases: FloatArray, whole: BoolArray, inputs: FloatArray | None = None
-) -> tuple[Piece, ...]:
+) -> tuple[KickInterval, ...]:
     """Cut a record where a phase jumps or a sample is missing.
 
     Args:
@@ -93,7 +93,7 @@ def between_kicks(
     cut = np.flatnonzero(kicked_steps(phases) | ~whole) + 1
     bounds = [0, *cut.tolist(), len(phases)]
     return tuple(
-        Piece(phases[i:j], None if inputs is None else inputs[i:j])
+        KickInterval(phases[i:j], None if inputs is None else inputs[i:j])
         for i, j in pairwise(bounds)
         if j - i > 1
     )
@@ -183,7 +183,7 @@ def _noise_share(fits: Sequence[OscillatorFit]) -> float:
     return (errors / squared) ** 0.5
 
 
-def _link(source: str, target: str, fit: OscillatorFit, k: int) -> Link:
+def _link(source: str, target: str, fit: OscillatorFit, k: int) -> OscillatorLink:
     """Return K and psi from (K cos psi, K sin psi), to first order in their errors."""
     pair: FloatArray = np.array([fit.in_phase[k], fit.quadrature[k]])
     size = float(np.hypot(pair[0], pair[1]))
@@ -198,7 +198,7 @@ def _link(source: str, target: str, fit: OscillatorFit, k: int) -> Link:
     shown = bool(fdtrc(2, fit.dof, F) < 1 - CONFIDENCE)
     low = max(0.0, size - half) if shown else 0.0
     lag = float(np.arctan2(pair[1], pair[0]))
-    return Link(
+    return OscillatorLink(
         source,
         target,
         Estimate(size, (low, size + half)),

@@ -187,7 +187,7 @@ def _angles(session: SessionView) -> JointSignals | None:
 
 
 @dataclass(frozen=True)
-class Piece:
+class KickInterval:
     """Phases between two kicks.
 
     Attributes:
@@ -241,7 +241,7 @@ def window_length(period_s: float) -> int:
 
 
 def fit_oscillator(
-    pieces: Sequence[Piece], period_s: float, target: int, sources: Sequence[int]
+    pieces: Sequence[KickInterval], period_s: float, target: int, sources: Sequence[int]
 ) -> OscillatorFit:
     """Estimate what turns one oscillator.
 
@@ -302,7 +302,7 @@ def _mirrored(covariance: FloatArray) -> FloatArray:
 
 
 def _equations(
-    piece: Piece, period_s: float, target: int, sources: Sequence[int], test: FloatArray
+    piece: KickInterval, period_s: float, target: int, sources: Sequence[int], test: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Regressors, instruments and left sides of a piece's windows, as mean rates."""
     length = test.size

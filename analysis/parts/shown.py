@@ -23,7 +23,7 @@ TERMINAL, PAGE = 0, 1
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ShownNumber:
     """A number with its digits after the point and its unit, which has its own space."""
 
     estimate: Estimate
@@ -35,15 +35,15 @@ class Quantity:
 class Ends:
     """An interval in a cell of its own."""
 
-    low: Quantity
-    high: Quantity
+    low: ShownNumber
+    high: ShownNumber
 
 
 class PValue(float):
     """A p-value."""
 
 
-Cell = str | int | Quantity | Ends | PValue | None
+Cell = str | int | ShownNumber | Ends | PValue | None
 """What stands in a cell; None is printed as a dash."""
 
 
@@ -78,7 +78,7 @@ class Column(Generic[Row]):
         if not isinstance(digits, int):
             digits = digits([value for value in values if isinstance(value, Estimate)])
         return [
-            Quantity(value, digits) if isinstance(value, Estimate) else value for value in values
+            ShownNumber(value, digits) if isinstance(value, Estimate) else value for value in values
         ]
 
 

@@ -58,7 +58,7 @@ LEAST_STEP = 0.05
 
 
 @dataclass(frozen=True)
-class Start:
+class DrivenStart:
     """Commands that were driven, and their response; both against the wanted wave.
 
     Attributes:
@@ -177,7 +177,9 @@ def compensation(
             "name a session of the gait that was kicked"
         )
     kicked = _kicked(coupling)
-    start = _driven(base, names, after) if after else Start(np.zeros(m, np.complex128), kicked)
+    start = (
+        _driven(base, names, after) if after else DrivenStart(np.zeros(m, np.complex128), kicked)
+    )
     gain = float(np.exp(np.mean(np.log(kicked.gain)))) if target_gain is None else target_gain
     if not gain > 0 or not keep >= 0:
         raise UsageError(f"--gain {gain:g} has to be above 0, --keep {keep:g} at least 0")
@@ -269,7 +271,7 @@ def _kicked(coupling: LocalCoupling) -> Response:
     return Response(ratio, (gain_error / gain) ** 2, np.square(base.lag_error), dof)
 
 
-def _driven(base: BaseGait, names: Sequence[str], after: Sequence[GaitRun]) -> Start:
+def _driven(base: BaseGait, names: Sequence[str], after: Sequence[GaitRun]) -> DrivenStart:
     """Return commands and response of the runs of a compensation, against the wanted wave."""
     first = after[0]
     for run in after:
@@ -291,7 +293,7 @@ def _driven(base: BaseGait, names: Sequence[str], after: Sequence[GaitRun]) -> S
     x = (np.log(np.abs(change)) + 1j * (phase - phase.mean())).astype(np.complex128)
     one = pooled.response
     ratio = (one.ratio * np.exp(x)).astype(np.complex128)
-    return Start(x, Response(ratio, one.log_gain_variance, one.lag_variance, one.dof))
+    return DrivenStart(x, Response(ratio, one.log_gain_variance, one.lag_variance, one.dof))
 
 
 def _limits(base: BaseGait, robot: Robot | None) -> FloatArray:

@@ -330,7 +330,7 @@ def _phases(
 
 
 @dataclass(frozen=True)
-class Mode:
+class DecayingMode:
     """A decaying mode.
 
     Attributes:
@@ -344,7 +344,7 @@ class Mode:
     time_constant_s: float
 
 
-def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
+def slowest_mode(robot: Robot, driven: Sequence[str]) -> DecayingMode:
     """Find the mode of the driven planes that decays slowest: how long a straight chain rings.
 
     What is measured without contact before the modes have died away is wrong. At small angles the
@@ -370,7 +370,7 @@ def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
     )
     slowest = complex(poles[int(np.argmax(poles.real))])
     size = abs(slowest)
-    return Mode(size / (2 * np.pi), -slowest.real / size, -1 / slowest.real)
+    return DecayingMode(size / (2 * np.pi), -slowest.real / size, -1 / slowest.real)
 
 
 def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:

@@ -23,7 +23,7 @@ from undulog.capture.common.files import as_text, csv_writer, number_cells, part
 from ..results.analysis import Analysis, GaitFacts, Index, JointInWindow, JointResult
 from ..results.answer import Artefact, Span
 from ..results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
-from ..results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
+from ..results.comparison import Comparison, Difference, Equivalence, MetadataChange, NamedJoint
 from ..results.coupling import (
     Coupling,
     HeldOut,
@@ -36,7 +36,7 @@ from ..results.coupling import (
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
 from ..results.frequency_response import JointTracking
-from ..results.oscillators import ChainCoupling, Link, Mode, Rate
+from ..results.oscillators import ChainCoupling, Mode, OscillatorLink, Rate
 from .text import shown_parts
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
@@ -262,7 +262,7 @@ def _of_comparison(result: Comparison) -> Frames:
         "differences": table(Difference, result.differences),
         "named": table(NamedJoint, result.named),
         "equivalence": table(Equivalence, result.equivalence),
-        "changed": table(Change, result.changed),
+        "changed": table(MetadataChange, result.changed),
         "waveforms": pd.concat(waves, ignore_index=True) if waves else pd.DataFrame(),
     }
 
@@ -286,7 +286,7 @@ def _oscillators(chains: Sequence[ChainCoupling]) -> Frames:
         return {}
     frames = {
         "oscillators": table(
-            Link,
+            OscillatorLink,
             [link for coupling in chains for link in coupling.links],
             plane=[coupling.plane for coupling in chains for _ in coupling.links],
         ),

@@ -37,7 +37,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from undulog.capture import SessionView
-from undulog.capture.commands.sessions import Line, first_sentence
+from undulog.capture.commands.sessions import SessionLine, first_sentence
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import part_file
@@ -150,7 +150,7 @@ def _page(
     return environment().get_template(template).render(v=view, left_out=left_out)
 
 
-def render_index(lines: Sequence[tuple[str, Line, str | None]]) -> str:
+def render_index(lines: Sequence[tuple[str, SessionLine, str | None]]) -> str:
     """Return the index of a folder of pages, one HTML page without outside references.
 
     Args:
@@ -292,7 +292,7 @@ class SessionsPage:
                 "put fewer on it, or give each a page of its own with -o FOLDER"
             )
 
-    def render(self, lines: Sequence[tuple[Path, tuple[str, Line]]]) -> str:
+    def render(self, lines: Sequence[tuple[Path, tuple[str, SessionLine]]]) -> str:
         """Return the page.
 
         Args:

@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 from undulog.capture.common.console import plain
 
 from ..experiment.reversal import SIGNIFICANT
-from ..parts.shown import PAGE, Cell, Ends, PValue, Quantity, Table
+from ..parts.shown import PAGE, Cell, Ends, PValue, ShownNumber, Table
 from ..results import formats
 from ..results.analysis import Analysis, Index, JointResult
 from ..results.coupling import LocalCoupling, RowCheck
@@ -200,7 +200,7 @@ def joint_mark(color: str, plane: str | None, *, driven: bool = True) -> Markup:
 
 def _shown(cell: Cell) -> Markup:
     match cell:
-        case Quantity(quantity, decimals, unit):
+        case ShownNumber(quantity, decimals, unit):
             return estimate(quantity, decimals, unit)
         case Ends(low, high):
             return Markup("{} to {}").format(_shown(low), _shown(high))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from ..parts.shown import Column, Ends, Quantity, Table, typical
+from ..parts.shown import Column, Ends, ShownNumber, Table, typical
 from ..results.analysis import GaitWindow
 from ..results.estimate import Estimate
 from ..results.formats import degrees, scaled
@@ -148,7 +148,7 @@ def _ends(estimates: Sequence[Estimate], decimals: int) -> Ends | None:
     values = [estimate.value for estimate in estimates if estimate.value is not None]
     if not values:
         return None
-    return Ends(*(Quantity(Estimate(end), decimals) for end in (min(values), max(values))))
+    return Ends(*(ShownNumber(Estimate(end), decimals) for end in (min(values), max(values))))
 
 
 def motion_table(motions: Sequence[JointMotion]) -> Table[JointMotion]:

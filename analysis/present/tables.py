@@ -21,7 +21,7 @@ from ..compare.decisions import (
     signed,
     signed_difference,
 )
-from ..parts.shown import Column, Ends, PValue, Quantity, Table, typical
+from ..parts.shown import Column, Ends, PValue, ShownNumber, Table, typical
 from ..results import formats
 from ..results.analysis import Analysis, Index, JointResult
 from ..results.body import BodyPoint, BodyResult
@@ -150,9 +150,9 @@ def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
     def rad(index: Index) -> bool:
         return index.unit == "rad"
 
-    def on_page(index: Index, number: float | None) -> Quantity:
+    def on_page(index: Index, number: float | None) -> ShownNumber:
         unit = {"rad": "°", "1": ""}.get(index.unit, index.unit)
-        return Quantity(Estimate(number), formats.decimals_for([value(index)], least=0), unit)
+        return ShownNumber(Estimate(number), formats.decimals_for([value(index)], least=0), unit)
 
     def ends(index: Index) -> Ends | None:
         ci95 = value(index).ci95
@@ -234,9 +234,11 @@ def _side(difference: Difference, value: float) -> str:
     return formats.number(value * factor, digits) + unit
 
 
-def _difference(difference: Difference) -> Quantity:
+def _difference(difference: Difference) -> ShownNumber:
     quantity, unit = in_people_units(difference)
-    return Quantity(quantity, formats.decimals_for([quantity], most=decimals_of(difference)), unit)
+    return ShownNumber(
+        quantity, formats.decimals_for([quantity], most=decimals_of(difference)), unit
+    )
 
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:

@@ -12,7 +12,7 @@ import numpy as np
 from undulog.capture.common import console as text_table
 from undulog.capture.common.console import UNLIMITED, plain
 
-from ..parts.shown import TERMINAL, AnyTable, Cell, Column, Ends, PValue, Quantity, Shown, Table
+from ..parts.shown import TERMINAL, AnyTable, Cell, Column, Ends, PValue, Shown, ShownNumber, Table
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.body import BodyShape, GroundContact, PlaneShape
@@ -214,7 +214,9 @@ class Sheet:
         cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
         styles = ["bold" if table.bold(row) else "" for row in table.rows]
         heads = [
-            text_table.Column(column.text or "", left=column.kind != "number", spare=column.spare)
+            text_table.TerminalColumn(
+                column.text or "", left=column.kind != "number", spare=column.spare
+            )
             for column in columns
         ]
         styled = zip(cells, styles, strict=True)
@@ -234,7 +236,7 @@ def _shown(cell: Cell) -> str:
     match cell:
         case None:
             return formats.MISSING
-        case Quantity(estimate, decimals, unit):
+        case ShownNumber(estimate, decimals, unit):
             value = formats.number(estimate.value, decimals) + unit
             return f"{value} {formats.interval(estimate.ci95, decimals)}".rstrip()
         case Ends(low, high):

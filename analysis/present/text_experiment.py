@@ -17,7 +17,7 @@ from ..experiment.reversal import SIGNIFICANT
 from ..parts.shown import Column, Table, typical
 from ..results import formats
 from ..results.body import BodyConnection, PredictedTravel
-from ..results.comparison import Change, Comparison
+from ..results.comparison import Comparison, MetadataChange
 from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
@@ -109,7 +109,7 @@ def render_comparison(
     return sheet.text()
 
 
-def _changed(changed: tuple[Change, ...]) -> list[str]:
+def _changed(changed: tuple[MetadataChange, ...]) -> list[str]:
     if not changed:
         return ["What was changed: not recorded; the recorded facts are the same."]
     lines = ["What was changed (A, then B):"]

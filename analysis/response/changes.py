@@ -56,7 +56,7 @@ _SPREAD = (1 + _POWER) ** 2 + _POWER**2  # of the logarithm, times the number of
 
 
 @dataclass(frozen=True)
-class Cycles:
+class CycleRatios:
     """Response over command in each cycle.
 
     Attributes:
@@ -226,7 +226,7 @@ def with_changes(response: Response, changes: ResponseChanges) -> Response:
 
 def _cycles(
     commands: Sequence[Series], responses: Sequence[Series], fit: HarmonicFit, channels: IntArray
-) -> Cycles | None:
+) -> CycleRatios | None:
     every = (*commands, *responses)
     turn_s = 2 * np.pi / fit.omega
     stop = min(float(channel.t_s[-1] + channel.period_s) for channel in every)
@@ -261,7 +261,7 @@ def _cycles(
     mean = fit.fundamental[channels[1]] / fit.fundamental[channels[0]]
     variances = noise.reshape(2, len(commands)).sum(axis=0)
     number = several * np.flatnonzero(usable).astype(np.float64)
-    return Cycles(number, whole[0], whole[1] / whole[0] * mean[:, None], variances)
+    return CycleRatios(number, whole[0], whole[1] / whole[0] * mean[:, None], variances)
 
 
 def _blocks(series: Sequence[Series]) -> Iterator[list[int]]:
@@ -343,7 +343,7 @@ def _kept(beside: float) -> float:
 _KEPT = tuple(_kept(offset) for offset in _BESIDE)
 
 
-def _amplitude_drift(cycles: Cycles) -> Estimate | None:
+def _amplitude_drift(cycles: CycleRatios) -> Estimate | None:
     """Return the relative change of the commands' amplitudes per cycle, None where they stay."""
     size: FloatArray = np.log(np.abs(cycles.command))
     place = cycles.number - cycles.number.mean()

@@ -38,7 +38,7 @@ _ENDS = 2  # half cycles whose mean frequency is that of a sweep's beginning or 
 _LONGEST = 16  # times the samples at the median interval: rates may change within a record
 
 
-class Kind(StrEnum):
+class ExcitationKind(StrEnum):
     """Kinds of excitation."""
 
     TONES = "sum of sines"
@@ -57,7 +57,7 @@ class Excitation:
         period_s: Of a command that repeats at least twice [s], else NaN.
     """
 
-    kind: Kind
+    kind: ExcitationKind
     tones_hz: FloatArray
     period_s: float
 
@@ -83,13 +83,13 @@ def find_excitation(command: Series) -> Excitation | None:
     repeated = _period(values) if tones is None or tones.size > 1 else None
     period_s = float("nan") if repeated is None else repeated * command.period_s
     if repeated is not None:
-        kind = Kind.PERIODIC
+        kind = ExcitationKind.PERIODIC
     elif tones is not None:
-        kind = Kind.TONES
+        kind = ExcitationKind.TONES
     elif np.unique(command.values).size <= LEVELS:
-        kind = Kind.STEPS
+        kind = ExcitationKind.STEPS
     else:
-        kind = Kind.CHIRP if _is_chirp(values) else Kind.NOISE
+        kind = ExcitationKind.CHIRP if _is_chirp(values) else ExcitationKind.NOISE
     return Excitation(kind, np.zeros(0) if tones is None else tones, period_s)
 
 

@@ -18,7 +18,7 @@ from ..estimators.series import Series, moves
 from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
-from .excitation import Excitation, Kind, excited_bins, find_excitation, swept_band
+from .excitation import Excitation, ExcitationKind, excited_bins, find_excitation, swept_band
 from .nonparametric import (
     ORDER,
     LineResponse,
@@ -95,7 +95,9 @@ def frequency_responses(
             joint_response(response.name, str(excitation.kind), sharing[name], lines),
             distortion=None if reference else _distortion(command, response, excitation),
             # The halves of a chirp excite different bands.
-            halves_agree=None if excitation.kind is Kind.CHIRP else _agreement(*estimates),
+            halves_agree=None
+            if excitation.kind is ExcitationKind.CHIRP
+            else _agreement(*estimates),
             method=INDIRECT if reference else DIRECT,
         )
 

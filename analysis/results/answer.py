@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from undulog.capture.judgement.fault import Apart, Change, ExtraMotion, RestsOff
+from undulog.capture.judgement.fault import Apart, ExtraMotion, ResponseChange, RestsOff
 
 _MOST = 12
 """Digits after which two numbers are taken for equal."""
@@ -278,7 +278,7 @@ class Answer:
     sentence: str = ""
     detail: str = ""
     not_following: tuple[NotFollowing, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[ResponseChange, ...] = ()
     extra: tuple[ExtraMotion, ...] = ()
     rests: tuple[RestsOff, ...] = ()
     apart: tuple[Apart, ...] = ()
@@ -314,7 +314,7 @@ def _first_clause(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class Reversal:
+class DeadBandEnd:
     """The dead band at one end of the motion.
 
     Attributes:
@@ -348,8 +348,8 @@ class DeadBand:
 
     kind: str
     evidence: str
-    top: Reversal
-    bottom: Reversal
+    top: DeadBandEnd
+    bottom: DeadBandEnd
     gain_change: float
     lag_change_rad: float
     cycles: int

@@ -26,7 +26,7 @@ def of_body(place: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Change:
+class MetadataChange:
     """One thing that the sessions say of themselves, and say otherwise.
 
     Attributes:
@@ -173,7 +173,7 @@ class Comparison(PresentedResult):
     a: tuple[SessionFacts, ...]
     b: tuple[SessionFacts, ...]
     partial: str | None
-    changed: tuple[Change, ...]
+    changed: tuple[MetadataChange, ...]
     named: tuple[NamedJoint, ...]
     differences: tuple[Difference, ...]
     equivalence: tuple[Equivalence, ...]

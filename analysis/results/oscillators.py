@@ -14,7 +14,7 @@ ENTRAINMENT_LABEL = (
 
 
 @dataclass(frozen=True)
-class Link:
+class OscillatorLink:
     """What one oscillator does to another.
 
     Attributes:
@@ -68,7 +68,7 @@ class ChainCoupling:
     kicks: int
     duration_s: float
     reach: int
-    links: tuple[Link, ...] = ()
+    links: tuple[OscillatorLink, ...] = ()
     oscillators: tuple[Rate, ...] = ()
 
 

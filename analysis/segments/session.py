@@ -11,7 +11,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.judgement.fault import Judgement
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, cycle_s
+from undulog.capture.judgement.motion import RecordedJoint, cycle_s
 from undulog.capture.judgement.session import motions_of, times_made
 from undulog.capture.robot.model import Robot
 
@@ -64,7 +64,7 @@ def following(session: SessionView, columns: Columns, window: Stretch) -> Follow
     return Following(judgement, offsets, frozenset(m.name for m in motions), in_frames)
 
 
-def _offsets(motion: JointMotion) -> FloatArray:
+def _offsets(motion: RecordedJoint) -> FloatArray:
     """Return the offset of each whole cycle [rad]."""
     t_s, command = motion.position.t_s, motion.command.at(motion.position.t_s)
     width = cycle_s(command, motion.position.period_s)

@@ -23,7 +23,14 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.common.process import in_threads
 
-from ..estimators.demodulation import Cycles, Phase, amplitudes, cycles_of, demodulate, weigh
+from ..estimators.demodulation import (
+    CycleResponses,
+    LoggedPhase,
+    amplitudes,
+    cycles_of,
+    demodulate,
+    weigh,
+)
 from ..estimators.intervals import t_factor
 from ..estimators.series import GAP_FACTOR, Series, clean
 from ..results.answer import Artefact, Note, Span
@@ -49,7 +56,7 @@ LEAST_COVERED = 0.9
 class _Pace:
     """A phase over one run, and the edges of its cycles [s]."""
 
-    phase: Phase
+    phase: LoggedPhase
     edges_s: FloatArray
 
 
@@ -223,13 +230,13 @@ def _joint(
     return JointOverTime(command.name, start, stop, tuple(number), rates, *_estimates(cycles))
 
 
-def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
+def _rising(t_s: FloatArray, value: FloatArray) -> LoggedPhase | None:
     """A phase that always increases, or None where it stands or turns back."""
     whole = value if value[-1] >= value[0] else -value
-    return Phase(t_s, whole) if np.all(np.diff(whole) > 0) else None
+    return LoggedPhase(t_s, whole) if np.all(np.diff(whole) > 0) else None
 
 
-def _estimates(cycles: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
+def _estimates(cycles: CycleResponses) -> tuple[Maybe, Intervals, Maybe, Intervals]:
     """Gain and lag with their intervals, as :mod:`.analysis.response.response` has them."""
     factor = t_factor(cycles.dof) if cycles.dof > 0 else float("nan")
     gain, lag = np.abs(cycles.ratio), -np.angle(cycles.ratio)

@@ -26,7 +26,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
 from undulog.capture.judgement.levels import HALF
-from undulog.capture.judgement.motion import JointMotion, Samples, course_of, cycle_s
+from undulog.capture.judgement.motion import RecordedJoint, Samples, course_of, cycle_s
 from undulog.capture.judgement.response import Filtered, fit_response
 from undulog.capture.log.read.sample_times import LARGEST, Signal
 
@@ -93,7 +93,7 @@ MOST_RATE = 50.0
 
 
 @dataclass(frozen=True)
-class Jumps:
+class PositionJumps:
     """What a position does that no joint can do.
 
     Attributes:
@@ -107,7 +107,9 @@ class Jumps:
     jumped: tuple[Span, ...]
 
 
-def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = ()) -> Jumps:
+def find_jumps(
+    position: Series, most_rate: float, released: tuple[Span, ...] = ()
+) -> PositionJumps:
     """Look for wraps and jumps.
 
     Args:
@@ -116,7 +118,7 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
             way that the joint has gone meanwhile.
     """
     t_s, value = position.t_s, position.values
-    nothing = Jumps((), 0.0, ())
+    nothing = PositionJumps((), 0.0, ())
     if value.size < 16:
         return nothing
     step, dt = np.diff(value), np.diff(t_s)
@@ -136,12 +138,12 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
     # Lone steps of any size may be a jump; a counter's single wrap is known by its size.
     whole_turn = any(abs(turn - size) < spread for size in _TURNS)
     if not alike or not (whole_turn or (at.size > 2 and np.ptp(value) < 2 * turn)):
-        return Jumps((), 0.0, tuple((float(t_s[k]), float(t_s[k + 1])) for k in at))
+        return PositionJumps((), 0.0, tuple((float(t_s[k]), float(t_s[k + 1])) for k in at))
     turns = np.zeros(value.size)
     turns[at + 1] = np.rint(excess / turn)
     count = np.cumsum(turns)
     levels, index = np.unique(count, return_inverse=True)
-    return Jumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
+    return PositionJumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
 
 
 def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
@@ -160,7 +162,7 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class Limits:
+class JointLimits:
     """What one joint can do, from the robot's description.
 
     Attributes:
@@ -188,7 +190,7 @@ class Limits:
         return (self.lower, self.upper, *sizes, *(-size for size in sizes))
 
 
-def limits_of(session: SessionView) -> dict[str, Limits]:
+def limits_of(session: SessionView) -> dict[str, JointLimits]:
     """Return the limits of the session's joints.
 
     Args:
@@ -202,11 +204,13 @@ def limits_of(session: SessionView) -> dict[str, Limits]:
         return {}
     # A twin's servos are as they are stated, whatever the robot's may be.
     stated = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
-    limits: dict[str, Limits] = {}
+    limits: dict[str, JointLimits] = {}
     for joint in robot.joints:
         servo = joint.servo
         sizes = (servo.stall_torque, servo.supply_v / servo.resistance_ohm, servo.supply_v)
-        limits[joint.name] = Limits(joint.lower, joint.upper, joint.max_velocity, *sizes, stated)
+        limits[joint.name] = JointLimits(
+            joint.lower, joint.upper, joint.max_velocity, *sizes, stated
+        )
     return limits
 
 
@@ -283,7 +287,7 @@ class _Joint:
     name: str
     raw: Mapping[str, Signal]
     series: Mapping[str, Series]
-    limits: Limits | None
+    limits: JointLimits | None
     driven: bool
 
 
@@ -381,7 +385,7 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
 def _linear(position: Series, command: Series) -> Series:
     """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
     asked, moved = (Samples(channel.t_s, channel.values) for channel in (command, position))
-    course = course_of([JointMotion(command.name, asked, moved)])
+    course = course_of([RecordedJoint(command.name, asked, moved)])
     if course is None or np.isfinite(cycle_s(course.command[0], course.step_s)):
         return command
     row = course.command[0], course.position[0], course.present[0], course.step_s

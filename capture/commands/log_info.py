@@ -17,7 +17,7 @@ from ..common.errors import DataError, UsageError
 from ..common.part_files import SUFFIX
 from ..log.file.content import session_label
 from ..log.messages.definitions import CONTRACT_VERSION
-from .sessions import Line, each, sessions_of, show, stated_gait
+from .sessions import SessionLine, each, sessions_of, show, stated_gait
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def log_info(file: Path, /, *more: Path, json: bool = False) -> int:
     return 0
 
 
-def _info_line(path: Path) -> Line:
+def _info_line(path: Path) -> SessionLine:
     from ..log.read.session import Session
 
     with Session.open(path) as session:
@@ -128,7 +128,7 @@ def _info_line(path: Path) -> Line:
     left = next((text for text in facts["warnings"] if SUFFIX in text), "")
     first = left or first  # a file that a killed writer left
     robot, verdict = facts["session"]["robot"] or "", facts["session"]["verdict"] or ""
-    return Line(robot, gait, verdict, first, facts)
+    return SessionLine(robot, gait, verdict, first, facts)
 
 
 def _label(session: dict[str, Any]) -> str:
@@ -247,7 +247,7 @@ def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
     return int(bool(contract))
 
 
-def _contract_line(path: Path) -> Line:
+def _contract_line(path: Path) -> SessionLine:
     from ..log.health.contract import check_contract
     from ..log.read.session import Session
 
@@ -257,7 +257,7 @@ def _contract_line(path: Path) -> Line:
         gait = stated_gait(session.metadata)
     first = str(contract[0]) if contract else "follows the log contract"
     verdict = _count(contract) if contract else "follows"
-    return Line(robot, gait, verdict, first, _contract_facts(path, contract), not contract)
+    return SessionLine(robot, gait, verdict, first, _contract_facts(path, contract), not contract)
 
 
 def _count(violations: Sequence[Violation]) -> str:
@@ -274,7 +274,7 @@ def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
     }
 
 
-def _check_line(path: Path, topics: JointTopicOptions) -> Line:
+def _check_line(path: Path, topics: JointTopicOptions) -> SessionLine:
     from ..log.health.session_check import check_session
     from ..log.read.session import Session
 
@@ -283,7 +283,7 @@ def _check_line(path: Path, topics: JointTopicOptions) -> Line:
         gait = stated_gait(session.metadata)
     said = (*health.reasons, *health.notes, "nothing is wrong with it")
     good = health.verdict != "bad"
-    return Line(health.robot or "", gait, health.verdict, said[0], as_json(health), good)
+    return SessionLine(health.robot or "", gait, health.verdict, said[0], as_json(health), good)
 
 
 def as_json(health: SessionHealth) -> dict[str, Any]:

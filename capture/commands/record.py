@@ -119,12 +119,12 @@ def record(
 
 
 def _run(settings: RecordSettings, stop: StopRequest, notifier: Notifier) -> RecordReport:
-    from ..recorder.recording import Recording
+    from ..recorder.recording import RunningRecording
     from ..recorder.screen import Terminal
 
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
-        recording = Recording(settings, stop, notifier=notifier)
+        recording = RunningRecording(settings, stop, notifier=notifier)
         watch = _live_view(recording.live_socket, relay) if settings.live else str
 
         def show(snapshot: RecorderSnapshot) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from ..common.console import UNLIMITED, Column, echo, emit, emit_json, plain, table
+from ..common.console import UNLIMITED, TerminalColumn, echo, emit, emit_json, plain, table
 from ..common.errors import DataError, MissingChannelError, RobotFileError
 from ..common.files import check_output, write_text
 from ..log.messages import COMMAND_TOPIC, RESPONSE_TOPIC
@@ -31,12 +31,12 @@ _MARGIN = 0.05
 """Part of a seen range that the limits lie beyond it, at each end."""
 
 _JOINTS = (
-    Column("joint", left=True),
-    Column("plane", left=True),
-    Column("lower/rad"),
-    Column("upper/rad"),
-    Column("rate/(rad/s)"),
-    Column("stall/(N m)"),
+    TerminalColumn("joint", left=True),
+    TerminalColumn("plane", left=True),
+    TerminalColumn("lower/rad"),
+    TerminalColumn("upper/rad"),
+    TerminalColumn("rate/(rad/s)"),
+    TerminalColumn("stall/(N m)"),
 )
 
 _TEMPLATE = """\

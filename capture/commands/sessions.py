@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..common.console import Column, emit_json, output_width, progress, table
+from ..common.console import TerminalColumn, emit_json, output_width, progress, table
 from ..common.errors import UndulogError
 
 _COLUMNS = (
-    Column("session", left=True),
-    Column("robot", left=True, spare=2),
-    Column("gait", left=True, spare=1),
-    Column("verdict", left=True),
-    Column("first sentence", left=True),
+    TerminalColumn("session", left=True),
+    TerminalColumn("robot", left=True, spare=2),
+    TerminalColumn("gait", left=True, spare=1),
+    TerminalColumn("verdict", left=True),
+    TerminalColumn("first sentence", left=True),
 )
 
 FAILED = "failed"
@@ -25,7 +25,7 @@ FAILED = "failed"
 
 
 @dataclass(frozen=True)
-class Line:
+class SessionLine:
     """A session in the table.
 
     Attributes:
@@ -109,7 +109,9 @@ def _session_of(path: Path) -> Path:
     return first_part(path) if path.suffix == ".mcap" and not path.is_dir() else path
 
 
-def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[str, Line]:
+def each(
+    what: Sequence[Any], verb: str, work: Callable[[Any], SessionLine]
+) -> dict[str, SessionLine]:
     """Do the work on each session, with progress on a terminal; one that fails has a line of why.
 
     Args:
@@ -122,7 +124,7 @@ def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[st
     what = list(dict.fromkeys(what))
     short = [one.name if isinstance(one, Path) else str(one) for one in what]
     names = [n if short.count(n) == 1 else str(one) for n, one in zip(short, what, strict=True)]
-    lines: dict[str, Line] = {}
+    lines: dict[str, SessionLine] = {}
     with progress(verb, total=len(names)) as bar:
         for k, (name, one) in enumerate(zip(names, what, strict=True)):
             bar.update(k, note=name)
@@ -131,11 +133,11 @@ def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[st
             except (UndulogError, OSError, MemoryError) as error:
                 why = str(error).removeprefix(f"{one}: ") or "there is not enough memory"
                 facts = {"path": str(one), "error": why}
-                lines[name] = Line(verdict=FAILED, sentence=why, facts=facts, good=False)
+                lines[name] = SessionLine(verdict=FAILED, sentence=why, facts=facts, good=False)
     return lines
 
 
-def show(lines: Mapping[str, Line], *, as_json: bool) -> int:
+def show(lines: Mapping[str, SessionLine], *, as_json: bool) -> int:
     """Print the table, or a list of JSON objects; return 1 if any line is not good, else 0."""
     if as_json:
         emit_json([line.facts for line in lines.values()])
@@ -148,7 +150,7 @@ def show(lines: Mapping[str, Line], *, as_json: bool) -> int:
     return int(not all(line.good for line in lines.values()))
 
 
-def _cells(line: Line) -> tuple[str, str, str, str]:
+def _cells(line: SessionLine) -> tuple[str, str, str, str]:
     return line.robot, line.gait, line.verdict, first_sentence(line.sentence)
 
 

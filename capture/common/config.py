@@ -35,7 +35,7 @@ from typing import (
     get_type_hints,
 )
 
-from .strict_table import Bound, Table, above, at_least
+from .strict_table import Bound, StrictTable, above, at_least
 
 _Class = TypeVar("_Class")
 
@@ -69,7 +69,7 @@ class Declared(NamedTuple):
     default: Any
     optional: bool
     bounds: tuple[Bound, ...]
-    read: Callable[[Table, Any], Any]
+    read: Callable[[StrictTable, Any], Any]
 
 
 @functools.cache
@@ -92,7 +92,7 @@ def _declared(item: dataclasses.Field[Any], hint: Any) -> Declared:
 
 def _reader(
     kind: Any, key: str, bounds: tuple[Bound, ...], is_name: bool
-) -> Callable[[Table, Any], Any]:
+) -> Callable[[StrictTable, Any], Any]:
     if get_origin(kind) is tuple:
         count = len(get_args(kind))
         return lambda table, default: table.numbers(key, count, *bounds, default=default)
@@ -101,7 +101,7 @@ def _reader(
     if dataclasses.is_dataclass(cast("object", kind)):
         part = cast("type[Any]", kind)
         return lambda table, _: read(table.table(key), part)
-    readers: dict[Any, Callable[[Table, Any], Any]] = {
+    readers: dict[Any, Callable[[StrictTable, Any], Any]] = {
         float: lambda table, default: table.number(key, *bounds, default=default),
         int: lambda table, default: table.integer(key, int(bounds[0].limit), default),
         bool: lambda table, default: table.flag(key, default=default),
@@ -116,7 +116,7 @@ def _no_reader(*_: Any) -> Any:
     raise TypeError("this field is read in a way of its own")
 
 
-def read(table: Table, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
+def read(table: StrictTable, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
     """Read a table as a dataclass declares it; unknown keys are faults.
 
     Args:
@@ -131,7 +131,7 @@ def read(table: Table, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
     return value
 
 
-def read_fields(table: Table, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
+def read_fields(table: StrictTable, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
     """Read the fields of a dataclass from a table that the caller closes, as :func:`read` does."""
     values = {
         name: own[name]() if name in own else _value(table, one, one.default)
@@ -143,7 +143,7 @@ def read_fields(table: Table, cls: type[_Class], **own: Callable[[], Any]) -> _C
     return value
 
 
-def read_field(table: Table, cls: type[Any], name: str, default: Any = None) -> Any:
+def read_field(table: StrictTable, cls: type[Any], name: str, default: Any = None) -> Any:
     """Read one field of a dataclass.
 
     Args:
@@ -154,12 +154,12 @@ def read_field(table: Table, cls: type[Any], name: str, default: Any = None) -> 
     return _value(table, one, one.default if default is None else default)
 
 
-def read_required(table: Table, cls: type[Any], name: str) -> Any:
+def read_required(table: StrictTable, cls: type[Any], name: str) -> Any:
     """Read one field of a dataclass that has to be there, whatever the class declares."""
     return declared(cls)[name].read(table, None)
 
 
-def _value(table: Table, one: Declared, default: Any) -> Any:
+def _value(table: StrictTable, one: Declared, default: Any) -> Any:
     if one.optional and default is None and table.look(one.key)[1] is None:
         return None
     return one.read(table, default)

@@ -76,7 +76,7 @@ _EXPORT = "export or record it again"
 
 
 @dataclass(frozen=True)
-class Limits:
+class ParserLimits:
     """What a parser may take.
 
     Attributes:
@@ -90,7 +90,7 @@ class Limits:
     file_size: int
 
     @classmethod
-    def of(cls, size: int) -> Limits:
+    def of(cls, size: int) -> ParserLimits:
         """Return the limits for a file of so many bytes."""
         return cls(
             memory=_MEMORY + _MEMORY_A_BYTE * size,
@@ -145,7 +145,7 @@ class Confined:
             UndulogError: An error of the tree that it raises.
         """
         try:
-            limits = Limits.of(size_of(path) if size is None else size)
+            limits = ParserLimits.of(size_of(path) if size is None else size)
         except OSError as error:
             raise self._kind(path, f"can't be read: {error.strerror or error}") from error
         child = self._idle.pop() if self._idle else self._started(path)
@@ -180,7 +180,7 @@ class Confined:
             why = f"can't be read: no process can be started for it: {error.strerror or error}"
             raise self._kind(path, why) from error
 
-    def _packet(self, child: _Child, path: Path, limits: Limits) -> Packet | None:
+    def _packet(self, child: _Child, path: Path, limits: ParserLimits) -> Packet | None:
         """Return the next packet, None at the end; raise what ended the parser."""
         try:
             packet = child.next(limits)
@@ -200,7 +200,7 @@ class Confined:
             raise self._error(path, failure, limits)
         return None
 
-    def _error(self, path: Path, failure: Mapping[str, Any], limits: Limits) -> Exception:
+    def _error(self, path: Path, failure: Mapping[str, Any], limits: ParserLimits) -> Exception:
         if failure["kind"] == MemoryError.__name__:
             return self._kind(path, _too_much_memory(limits))
         kind = getattr(errors, failure["kind"], None)
@@ -213,7 +213,7 @@ class Confined:
         return error
 
 
-def _end_of(code: int | None, limits: Limits) -> str:
+def _end_of(code: int | None, limits: ParserLimits) -> str:
     """Return why a child that ended without an answer did so."""
     if code == -signal.SIGXCPU:
         return (
@@ -227,7 +227,7 @@ def _end_of(code: int | None, limits: Limits) -> str:
     return "can't be read: the process that read it ended early"
 
 
-def _too_much_memory(limits: Limits) -> str:
+def _too_much_memory(limits: ParserLimits) -> str:
     return (
         f"takes more than {limits.memory // _MIB} MiB of memory to read, too much for its size: "
         f"it is damaged; {_EXPORT}"
@@ -276,12 +276,14 @@ class _Child:
             there.close()
             os.close(alive)
 
-    def request(self, parser: str, path: Path, limits: Limits, options: Mapping[str, Any]) -> None:
+    def request(
+        self, parser: str, path: Path, limits: ParserLimits, options: Mapping[str, Any]
+    ) -> None:
         facts = {"parser": parser, "path": str(path), "limits": asdict(limits), "options": options}
         self.is_free = False
         send(self._link, Packet(facts))
 
-    def next(self, limits: Limits) -> Packet | None:
+    def next(self, limits: ParserLimits) -> Packet | None:
         """Return the next packet; None if the child has ended.
 
         Raises:
@@ -315,7 +317,7 @@ class _Child:
         with suppress(OSError):  # it ended: the next packet is its end
             self._link.send(TAKEN)
 
-    def stopped(self, limits: Limits) -> bool:
+    def stopped(self, limits: ParserLimits) -> bool:
         """Have the parser stop if it hasn't; return whether the child is of use again."""
         if self.is_free:
             return True

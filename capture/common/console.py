@@ -159,7 +159,7 @@ Cells = Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
-class Column:
+class TerminalColumn:
     """A column of a table.
 
     Attributes:
@@ -176,7 +176,7 @@ class Column:
 
 
 def table(
-    columns: Sequence[Column], rows: Sequence[Cells], width: int, *, cropped: bool = False
+    columns: Sequence[TerminalColumn], rows: Sequence[Cells], width: int, *, cropped: bool = False
 ) -> tuple[list[Text], list[str]]:
     """Lay out a table, without columns that it can spare where the terminal is too narrow.
 

@@ -102,7 +102,7 @@ class DamagedFileError(InputFileError):
 
 
 @dataclass(frozen=True)
-class Fault:
+class DescriptionFault:
     """One fault of a description file.
 
     Attributes:
@@ -118,7 +118,7 @@ class Fault:
         return f"{self.key}: found {self.found}; valid: {self.valid}"
 
 
-def _listing(faults: Sequence[Fault], place: str) -> str:
+def _listing(faults: Sequence[DescriptionFault], place: str) -> str:
     count = len(faults)
     head = f"{count} fault{'s' if count != 1 else ''} in {place}"
     return "\n".join([head, *(f"  {fault}" for fault in faults)])
@@ -129,10 +129,10 @@ class FaultyFileError(UndulogError, ValueError):
 
     kind = "file"
 
-    def __init__(self, path: Path | str, faults: Iterable[Fault]) -> None:
+    def __init__(self, path: Path | str, faults: Iterable[DescriptionFault]) -> None:
         """Build the message from all faults, at least one."""
         self.path = Path(path)
-        self.faults: tuple[Fault, ...] = tuple(faults)
+        self.faults: tuple[DescriptionFault, ...] = tuple(faults)
         super().__init__(f"{path}: {_listing(self.faults, f'this {self.kind}')}")
 
 
@@ -163,14 +163,14 @@ class NullModelError(FaultyFileError):
 class SettingsError(UsageError):
     """The settings of a recording have faults, wherever they come from."""
 
-    def __init__(self, faults: Iterable[Fault]) -> None:
+    def __init__(self, faults: Iterable[DescriptionFault]) -> None:
         """Build the message.
 
         Args:
             faults: All faults, at least one; their keys are the places: ``--ring``,
                 ``UNDULOG_RECORD_RING`` or ``snake.toml: record.ring``.
         """
-        self.faults: tuple[Fault, ...] = tuple(faults)
+        self.faults: tuple[DescriptionFault, ...] = tuple(faults)
         super().__init__(_listing(self.faults, "the settings of this recording"))
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from .console import refuse_existing
 from .errors import (
-    Fault,
+    DescriptionFault,
     FaultyFileError,
     InputFileError,
     LogWriteError,
@@ -153,7 +153,7 @@ class Shelf:
         try:
             return Description(read_input(path).decode("utf-8"), path, path.parent)
         except UnicodeDecodeError as error:
-            fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
+            fault = DescriptionFault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
             raise self.error(path, [fault]) from error
 
     def _place(self) -> Traversable:

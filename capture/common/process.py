@@ -186,7 +186,7 @@ def in_threads(
         return [result for share in pool.map(work, shares) for result in share]
 
 
-class Piece(Generic[_Result]):
+class WorkPiece(Generic[_Result]):
     """A piece of work that is done by a helper thread, or by the caller if none has begun it."""
 
     def __init__(self, work: Callable[[], _Result], helpers: ThreadPoolExecutor | None) -> None:

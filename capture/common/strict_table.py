@@ -1,7 +1,7 @@
 """Strict reading of TOML tables: all faults are collected before an error is raised.
 
-A :class:`Table` returns the values of one TOML table. A value that is missing, of the wrong type
-or out of range is added to a :class:`Faults` and replaced by a harmless substitute (NaN for
+A :class:`StrictTable` returns the values of one TOML table. A value that is missing, of the wrong
+type or out of range is added to a :class:`Faults` and replaced by a harmless substitute (NaN for
 numbers: comparisons with it are false, so that one fault does not cause another); the caller raises
 once at the end. Keys that were not read are faults too: a mistyped key never passes for a default.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeVar, cast
 
-from .errors import Fault
+from .errors import DescriptionFault
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
 _Value = TypeVar("_Value")
@@ -108,7 +108,7 @@ class Faults:
 
     def __init__(self) -> None:
         """Start with none."""
-        self._faults: dict[Fault, None] = {}
+        self._faults: dict[DescriptionFault, None] = {}
 
     @property
     def full(self) -> bool:
@@ -118,14 +118,16 @@ class Faults:
     def add(self, key: str, found: str, valid: str) -> None:
         """Note a fault, long texts cut."""
         if not self.full:
-            self._faults[Fault(*(_cut(text, _LONGEST_TEXT) for text in (key, found, valid)))] = None
+            self._faults[
+                DescriptionFault(*(_cut(text, _LONGEST_TEXT) for text in (key, found, valid)))
+            ] = None
 
-    def all(self) -> tuple[Fault, ...]:
+    def all(self) -> tuple[DescriptionFault, ...]:
         """Return all faults, in the order found, at most 200."""
         return tuple(self._faults)
 
 
-class Table:
+class StrictTable:
     """One TOML table, with optional defaults behind it.
 
     Attributes:
@@ -137,7 +139,7 @@ class Table:
         values: Mapping[str, Any],
         where: str,
         faults: Faults,
-        defaults: Table | None = None,
+        defaults: StrictTable | None = None,
     ) -> None:
         """Wrap a table.
 
@@ -155,13 +157,13 @@ class Table:
         self._asked[key] = None
         return key in self.values
 
-    def over(self, defaults: Table) -> Table:
+    def over(self, defaults: StrictTable) -> StrictTable:
         """Return the same table, nothing read yet, with defaults behind it."""
-        return Table(self.values, self._where, self.faults, defaults)
+        return StrictTable(self.values, self._where, self.faults, defaults)
 
-    def replaced(self, values: Mapping[str, Any]) -> Table:
+    def replaced(self, values: Mapping[str, Any]) -> StrictTable:
         """Return a table of other values in the same place."""
-        return Table(values, self._where, self.faults)
+        return StrictTable(values, self._where, self.faults)
 
     def key(self, key: str) -> str:
         """Return the full key, e.g. ``joints[3].plane``."""
@@ -313,27 +315,27 @@ class Table:
                 good[word] = None
         return tuple(good)
 
-    def table(self, key: str, defaults: Table | None = None) -> Table:
+    def table(self, key: str, defaults: StrictTable | None = None) -> StrictTable:
         """Read a sub-table, with its defaults; an empty one when absent or after a fault."""
         self._asked[key] = None
         value = self.values.get(key, {})
         if not isinstance(value, dict):
             self.fault(key, "a table")
             value = {}
-        return Table(cast("dict[str, Any]", value), self.key(key), self.faults, defaults)
+        return StrictTable(cast("dict[str, Any]", value), self.key(key), self.faults, defaults)
 
-    def tables(self, key: str) -> list[Table]:
+    def tables(self, key: str) -> list[StrictTable]:
         """Read an array of tables; empty when absent, without the invalid ones."""
         self._asked[key] = None
         value = self.values.get(key, [])
         if not isinstance(value, list):
             self.fault(key, "an array of tables")
             return []
-        good: list[Table] = []
+        good: list[StrictTable] = []
         for i, entry in enumerate(cast("list[object]", value)):
             where = f"{self.key(key)}[{i}]"
             if isinstance(entry, dict):
-                good.append(Table(cast("dict[str, Any]", entry), where, self.faults))
+                good.append(StrictTable(cast("dict[str, Any]", entry), where, self.faults))
             else:
                 self.faults.add(where, shown(entry), "a table")
         return good

@@ -33,9 +33,9 @@ import numpy as np
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..common.config import Positive, read_field
-from ..common.errors import Fault, FaultyFileError, UsageError
+from ..common.errors import DescriptionFault, FaultyFileError, UsageError
 from ..common.files import read_input
-from ..common.strict_table import NAME_PATTERN, NONZERO, Faults, Table, listed
+from ..common.strict_table import NAME_PATTERN, NONZERO, Faults, StrictTable, listed
 from ..common.untrusted_text import read_toml
 from ..log.write.channels import JointStateChannel
 from ..log.write.writer import SessionWriter
@@ -59,7 +59,7 @@ _MOST_PARTS = 100
 
 
 @dataclass(frozen=True)
-class Column:
+class MappedColumn:
     """One column that is read.
 
     Attributes:
@@ -103,7 +103,7 @@ class ColumnMap:
 
     time_column: str
     time_unit: str
-    columns: tuple[Column, ...]
+    columns: tuple[MappedColumn, ...]
     delimiter: str = ","
     commands_time: tuple[str, str] | None = None
 
@@ -139,7 +139,7 @@ def read_column_map(path: Path, robot: Robot | None) -> ColumnMap:
     try:
         values = read_toml(read_input(path).decode("utf-8"))
     except ValueError as error:
-        raise FaultyFileError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
+        raise FaultyFileError(path, [DescriptionFault("syntax", str(error), "TOML 1.0")]) from error
     column_map, faults = _parse(values, robot)
     if faults:
         raise FaultyFileError(path, faults)
@@ -190,9 +190,11 @@ def _cut(option: str) -> tuple[str, str, str]:
     return column, equals, meaning + comma + extras
 
 
-def _parse(values: dict[str, Any], robot: Robot | None) -> tuple[ColumnMap, tuple[Fault, ...]]:
+def _parse(
+    values: dict[str, Any], robot: Robot | None
+) -> tuple[ColumnMap, tuple[DescriptionFault, ...]]:
     faults = Faults()
-    top = Table(values, "", faults)
+    top = StrictTable(values, "", faults)
     delimiter = top.text("delimiter", ",")
     if delimiter not in _DELIMITERS:
         top.fault("delimiter", " ".join(json.dumps(each) for each in _DELIMITERS))
@@ -207,7 +209,7 @@ def _parse(values: dict[str, Any], robot: Robot | None) -> tuple[ColumnMap, tupl
     return ColumnMap(*time, columns, delimiter, own), faults.all()
 
 
-def _time(table: Table) -> tuple[str, str]:
+def _time(table: StrictTable) -> tuple[str, str]:
     column, unit = table.text("column"), table.text("unit")
     if unit not in TIME_UNITS:
         table.fault("unit", listed(TIME_UNITS, unit))
@@ -215,7 +217,7 @@ def _time(table: Table) -> tuple[str, str]:
     return column, unit
 
 
-def _column(table: Table, joints: Iterable[str] | None) -> Column:
+def _column(table: StrictTable, joints: Iterable[str] | None) -> MappedColumn:
     name, joint = table.text("column"), table.text("joint")
     if joint and joints is not None and joint not in joints:
         table.fault("joint", listed(joints, joint))
@@ -230,21 +232,21 @@ def _column(table: Table, joints: Iterable[str] | None) -> Column:
     place = table.text("table", STATES)
     if place not in {STATES, COMMANDS}:
         table.fault("table", f"{STATES}, {COMMANDS}")
-    column = Column(
+    column = MappedColumn(
         column=name,
         joint=joint,
         quantity=quantity or Quantity.POSITION,
         unit=unit,
-        wrap=read_field(table, Column, "wrap"),
-        scale=read_field(table, Column, "scale"),
-        offset=read_field(table, Column, "offset"),
+        wrap=read_field(table, MappedColumn, "wrap"),
+        scale=read_field(table, MappedColumn, "scale"),
+        offset=read_field(table, MappedColumn, "offset"),
         table=place,
     )
     table.close()
     return column
 
 
-def _note_repeated(faults: Faults, columns: Sequence[Column]) -> None:
+def _note_repeated(faults: Faults, columns: Sequence[MappedColumn]) -> None:
     targets = [f"{column.joint}.{column.quantity}" for column in columns]
     for target in sorted({target for target in targets if targets.count(target) > 1}):
         faults.add("columns", f"{targets.count(target)} columns for {target}", "one at most")

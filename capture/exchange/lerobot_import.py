@@ -31,7 +31,7 @@ from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import FLOAT32, ImportReport, file_digest
 from .column_blocks import Block, refuse, rows_of_block, spread
-from .column_map import STATES, Column, ColumnMap
+from .column_map import STATES, ColumnMap, MappedColumn
 from .parquet_blocks import ParquetReader, vectors_of
 from .table_import import TableSet, import_tables
 from .tables import TableFile
@@ -210,7 +210,7 @@ def import_lerobot(
 
 def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, list[str]]:
     notes = [f"times made from the frame number and fps = {dataset.fps:g}, as the dataset has them"]
-    columns: list[Column] = []
+    columns: list[MappedColumn] = []
     for feature, names in dataset.names.items():
         quantity = FEATURES[feature]
         unit = units.get(quantity, "")
@@ -219,7 +219,9 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
             notes.append(
                 f"{feature} taken as {unit}: no unit given (--unit {quantity}=UNIT overrides)"
             )
-        columns += [Column(f"{feature}[{i}]", name, quantity, unit) for i, name in enumerate(names)]
+        columns += [
+            MappedColumn(f"{feature}[{i}]", name, quantity, unit) for i, name in enumerate(names)
+        ]
     if dataset.left_out:
         notes.append(f"features without a place left out: {some_names(dataset.left_out, 10)}")
     return ColumnMap("time", "ns", tuple(columns)), notes

@@ -36,7 +36,7 @@ _BARE_TOPIC = re.compile(r"[A-Za-z0-9_/-]+")
 
 
 @dataclass(frozen=True)
-class Curve:
+class TopicCurve:
     """One topic's angles of a joint.
 
     Attributes:
@@ -57,7 +57,7 @@ class JointPlot:
     """The curves of a joint."""
 
     joint: str
-    curves: tuple[Curve, ...]
+    curves: tuple[TopicCurve, ...]
 
 
 def export_foxglove_layout(
@@ -146,7 +146,7 @@ def _plots(
             missing = " and no ".join(usual)
             raise MissingChannelError(source, missing, sorted(session.channels))
         read = session.joint_columns({topic: ["position"] for topic in wanted})
-        curves: dict[str, list[Curve]] = {}
+        curves: dict[str, list[TopicCurve]] = {}
         for number, topic in enumerate(wanted):
             signals = read[topic, "position"]
             places = _places(session.joint_orders(topic))
@@ -154,7 +154,7 @@ def _plots(
             for joint, values in zip(signals.names, signals.values, strict=True):
                 finite = values[np.isfinite(values)]
                 low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0, 0)
-                curve = Curve(topic, places.get(joint), color, low, high)
+                curve = TopicCurve(topic, places.get(joint), color, low, high)
                 curves.setdefault(joint, []).append(curve)
         plots = [JointPlot(name, tuple(curve)) for name, curve in curves.items()]
         return plots, session.duration_s, session.warnings

@@ -23,7 +23,7 @@ from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, UNITS, v
 from ..robot.description import numbered
 from ..robot.model import Quantity
 from .column_blocks import WIDEST, Block
-from .column_map import COMMANDS, STATES, Column, ColumnMap
+from .column_map import COMMANDS, STATES, ColumnMap, MappedColumn
 from .frame_log import LATEST_NS
 from .marker_tracks import is_frame_number
 from .tables import TableFile, is_time, words
@@ -286,8 +286,8 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
     samples: Mapping[str, Block],
     said: list[str],
     left_out: list[str],
-) -> list[Column]:
-    columns: list[Column] = []
+) -> list[MappedColumn]:
+    columns: list[MappedColumn] = []
     taken: dict[tuple[str, Quantity], str] = {}
     assumed: dict[Quantity, str] = {}
     single = _single_joint(found, names)
@@ -313,7 +313,7 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
         wrap = 0.0 if stated else _wrap(samples[role][name], quantity, unit)
         if wrap:
             said.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
-        columns.append(Column(name, joint, quantity, unit, wrap=wrap, table=role))
+        columns.append(MappedColumn(name, joint, quantity, unit, wrap=wrap, table=role))
     said += [
         f"{_PLURAL.get(quantity, f'{quantity}s')} taken as {unit}: no unit given "
         f"(--unit {quantity}=UNIT overrides)"

@@ -27,7 +27,7 @@ from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import LEVEL, ImportReport, digest_of, imported_session
 from .column_blocks import Block, joined
-from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
+from .column_map import COMMANDS, STATES, ColumnMap, JointTopic, MappedColumn, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .marker_tracks import as_joints, with_fps
 from .table_guess import guess_map
@@ -322,7 +322,7 @@ class _Source:
     ) -> Iterator[_Messages]:
         """Yield the messages of each block, in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
-        columns: dict[Quantity, list[Column]] = {}
+        columns: dict[Quantity, list[MappedColumn]] = {}
         for (_, quantity), column in found.items():
             columns.setdefault(quantity, []).append(column)
         topics = [
@@ -383,7 +383,7 @@ class _Source:
             )
         return stamps
 
-    def _converted(self, columns: Sequence[Column], block: Block) -> FloatArray:
+    def _converted(self, columns: Sequence[MappedColumn], block: Block) -> FloatArray:
         """Return the cells of some columns in the session's unit, shape (n, m).
 
         They have single precision if all of them had it and none is converted.
@@ -408,7 +408,7 @@ class _Source:
             values[:, k] = self._in_unit(columns[k], values[:, k])
         return values
 
-    def _numbers(self, column: Column, cells: NDArray[Any]) -> NDArray[Any]:
+    def _numbers(self, column: MappedColumn, cells: NDArray[Any]) -> NDArray[Any]:
         if cells.dtype.kind in "fiu":
             return cells
         try:
@@ -419,7 +419,7 @@ class _Source:
                 self.table.path, f"column {column.column!r}: {bad!r} is not a number"
             ) from error
 
-    def _in_unit(self, column: Column, values: FloatArray) -> FloatArray:
+    def _in_unit(self, column: MappedColumn, values: FloatArray) -> FloatArray:
         """Convert numbers to the session's unit: unwrapped over blocks, scaled and offset."""
         known = ~np.isnan(values)
         if column.wrap and known.any():

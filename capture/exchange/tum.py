@@ -40,7 +40,7 @@ _LINES_PER_BLOCK = 10_000
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class PoseTrajectory:
     """Poses of one frame.
 
     Attributes:
@@ -130,7 +130,7 @@ def _lines(t_ns: IntArray, poses: FloatArray) -> Iterator[str]:
         yield f"{seconds}.{rest:09d} {' '.join(map(repr, pose))}\n"
 
 
-def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
+def read_trajectory(session: Session, frame: str | None = None) -> PoseTrajectory:
     """Return the poses of a frame, in the order of the log.
 
     Args:
@@ -160,7 +160,7 @@ def read_trajectory(session: Session, frame: str | None = None) -> Trajectory:
     return found
 
 
-def _of_poses(session: Session, topic: str, kind: str) -> Iterator[Trajectory]:
+def _of_poses(session: Session, topic: str, kind: str) -> Iterator[PoseTrajectory]:
     """Yield the poses of each frame of a topic; a pose without a name has that of its topic."""
     numbers = [f"{_POSE_FIELD[kind]}.{name}" for name in _NUMBERS]
     names = ["header.frame_id", *(["child_frame_id"] if kind == _ODOMETRY else [])]
@@ -175,12 +175,12 @@ def _of_poses(session: Session, topic: str, kind: str) -> Iterator[Trajectory]:
     for child in dict.fromkeys(children.tolist()):
         mine = children == child
         own = tuple(dict.fromkeys(parents[mine].tolist()))
-        yield Trajectory(topic, str(child), own, t_ns[mine], poses[mine])
+        yield PoseTrajectory(topic, str(child), own, t_ns[mine], poses[mine])
 
 
 def _of_transforms(
     session: Session, topics: Sequence[str], frame: str | None
-) -> tuple[Trajectory | None, list[str]]:
+) -> tuple[PoseTrajectory | None, list[str]]:
     """Return the poses of a frame in its parent, by all topics; and the frames that there are."""
     names: dict[str, None] = {}
     times: list[int] = []
@@ -205,4 +205,4 @@ def _of_transforms(
     if frame is None or not times:
         return None, list(names)
     t_ns = np.array(times, dtype=np.int64)
-    return Trajectory(where, frame, tuple(parents), t_ns, np.array(poses)), list(names)
+    return PoseTrajectory(where, frame, tuple(parents), t_ns, np.array(poses)), list(names)

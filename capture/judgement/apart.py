@@ -16,7 +16,7 @@ from .exposure import LIKE_LAG_S, Exposure, median_response, responds
 from .fault import Apart
 from .levels import ENOUGH_LIKE, QUARTER, TINY
 from .motion import Course
-from .response import Filtered, Response
+from .response import Filtered, JointResponse
 
 
 def find_apart(
@@ -68,7 +68,7 @@ def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[flo
     return found
 
 
-def _slope(course: Course, common: Response, k: int) -> float:
+def _slope(course: Course, common: JointResponse, k: int) -> float:
     """Return the slope of a joint's position over what a response makes of its command."""
     known = course.present[k]
     asked = Filtered(course.command[k][None, :], course.step_s).output(common)[0][known]

@@ -24,8 +24,8 @@ from .levels import (
     REST_ERRORS,
     WHOLE,
 )
-from .motion import Course, JointMotion, cycle_s
-from .response import SETTLED, Filtered, Response
+from .motion import Course, RecordedJoint, cycle_s
+from .response import SETTLED, Filtered, JointResponse
 
 LIKE_LAG_S = 0.05
 """Difference in lag up to which joints may be of one kind [s]: two control periods of a slow bus
@@ -50,7 +50,7 @@ class Exposure:
 
     healthy: FloatArray
     fitted: FloatArray
-    responses: tuple[Response, ...]
+    responses: tuple[JointResponse, ...]
     like: tuple[int, ...]
     rest_rad: FloatArray
     least_rad: FloatArray
@@ -62,7 +62,7 @@ class Exposure:
 
 
 def exposure_of(
-    course: Course, motions: Sequence[JointMotion], responses: Sequence[Response]
+    course: Course, motions: Sequence[RecordedJoint], responses: Sequence[JointResponse]
 ) -> Exposure:
     """Compute where joints had to move.
 
@@ -91,7 +91,7 @@ def exposure_of(
         if len(group) >= ENOUGH_LIKE and sound:
             common = median_response(sound)
         else:
-            common = Response(_usual_gain([responses[j] for j in others]))
+            common = JointResponse(_usual_gain([responses[j] for j in others]))
         offset = response.offset_rad
         healthy[k] = offset + common.gain * filtered[k].output(common)[0]
         pool = group if len(group) >= ENOUGH_LIKE else others
@@ -118,7 +118,7 @@ def _half_cycle_s(command: FloatArray, step_s: float) -> float:
     return cycle / 2 if np.isfinite(cycle) else 0.0
 
 
-def _usual_gain(others: Sequence[Response]) -> float:
+def _usual_gain(others: Sequence[JointResponse]) -> float:
     """Return the gain to ask of a joint without like joints: 1, or less where most give less.
 
     The joints of a body too heavy for its motors follow by less, and none of them is at fault.
@@ -129,12 +129,12 @@ def _usual_gain(others: Sequence[Response]) -> float:
     return min(1.0, max(float(np.median(gains)), QUARTER))
 
 
-def responds(response: Response) -> bool:
+def responds(response: JointResponse) -> bool:
     """Return whether a joint responds to its command, the right way round."""
     return response.gain >= QUARTER and response.explained >= HALF
 
 
-def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tuple[int, ...]:
+def _like(motions: Sequence[RecordedJoint], responses: Sequence[JointResponse]) -> tuple[int, ...]:
     """Number the groups of joints that are like by their description, or else by most of them."""
     kinds = [motion.kind for motion in motions]
     if all(kind is not None for kind in kinds):
@@ -150,19 +150,19 @@ def _like(motions: Sequence[JointMotion], responses: Sequence[Response]) -> tupl
     return (0,) * len(motions)
 
 
-def agrees(response: Response, common: Response) -> bool:
+def agrees(response: JointResponse, common: JointResponse) -> bool:
     """Return whether a response is a common one, up to a profile along the body."""
     return abs(response.gain / common.gain - 1) < QUARTER and (
         abs(response.lag_s - common.lag_s) < max(QUARTER * common.lag_s, LIKE_LAG_S)
     )
 
 
-def median_response(responses: Sequence[Response]) -> Response:
+def median_response(responses: Sequence[JointResponse]) -> JointResponse:
     """Return the response of the joint of median lag, with the median gain."""
     lags = np.array([response.lag_s for response in responses])
     middle = responses[int(np.argsort(lags)[(lags.size - 1) // 2])]
     gain = float(np.median([response.gain for response in responses]))
-    return Response(gain, 0.0, middle.delay_s, middle.constant_s, middle.order, middle.damping)
+    return JointResponse(gain, 0.0, middle.delay_s, middle.constant_s, middle.order, middle.damping)
 
 
 def _lost_motion(residual: FloatArray) -> float:

@@ -59,7 +59,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Change:
+class ResponseChange:
     """A joint whose response changed during the session: a difference, no fault.
 
     Attributes:
@@ -194,7 +194,7 @@ class Judgement:
     """
 
     faults: tuple[Fault, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[ResponseChange, ...] = ()
     extra: tuple[ExtraMotion, ...] = ()
     rests: tuple[RestsOff, ...] = ()
     apart: tuple[Apart, ...] = ()
@@ -203,9 +203,9 @@ class Judgement:
     naming: str = ""
 
 
-def clause_of(difference: Change | ExtraMotion | RestsOff | Apart, name: str) -> str:
+def clause_of(difference: ResponseChange | ExtraMotion | RestsOff | Apart, name: str) -> str:
     """Return a difference of one joint as a clause that begins with the joint's name."""
-    return f"{name}{':' if isinstance(difference, Change) else ''} {difference.text}"
+    return f"{name}{':' if isinstance(difference, ResponseChange) else ''} {difference.text}"
 
 
 NOTHING = Judgement()

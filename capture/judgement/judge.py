@@ -20,7 +20,7 @@ from .blocks import SHORTEST_S, Jump
 from .bursts import find_bursts
 from .changes import find_jumps
 from .exposure import Exposure, agrees, exposure_of, median_response, responds
-from .fault import Change, ExtraMotion, Fault, Judgement, RestsOff, Span
+from .fault import ExtraMotion, Fault, Judgement, ResponseChange, RestsOff, Span
 from .levels import (
     FEWEST,
     FOLLOWS,
@@ -34,10 +34,10 @@ from .levels import (
     WIDTH,
 )
 from .lines import find_lines, vibrates
-from .motion import Course, JointMotion, course_of, cycle_s, rises_of, runs_of
-from .naming import Kind, Naming, Verdict, in_words, permutation_of
+from .motion import Course, RecordedJoint, course_of, cycle_s, rises_of, runs_of
+from .naming import ExplanationKind, Naming, NamingVerdict, in_words, permutation_of
 from .record import record_faults
-from .response import BLOCKS, LATEST_S, Response, fit_response
+from .response import BLOCKS, LATEST_S, JointResponse, fit_response
 from .rests import find_rests
 from .standing import opposite_kinds, standing_kinds
 from .stillness import Stillness, stillness_of, usable_steps
@@ -49,7 +49,7 @@ MOVING = frozenset({"swapped", "inverted", "inverted_sensor", "noisy_sensor"})
 """Kinds of a joint that moves, though not as commanded."""
 
 
-def judge(motions: Sequence[JointMotion]) -> Judgement:
+def judge(motions: Sequence[RecordedJoint]) -> Judgement:
     """Judge the joints of a session.
 
     Args:
@@ -63,7 +63,7 @@ def judge(motions: Sequence[JointMotion]) -> Judgement:
         return Judgement(tuple(faults))
     samples = course.position.size
 
-    def response_of(k: int) -> Response:
+    def response_of(k: int) -> JointResponse:
         return fit_response(course.command[k], course.position[k], course.present[k], course.step_s)
 
     responses = in_threads(response_of, range(len(driven)), samples)
@@ -135,7 +135,7 @@ def _too_seldom(course: Course) -> bool:
     return bool(2 * np.count_nonzero(seldom) > seldom.size)
 
 
-def _lasts(motion: JointMotion) -> bool:
+def _lasts(motion: RecordedJoint) -> bool:
     """Return whether command and position overlap, with samples for the blocks of a fit."""
     command, position = motion.command.t_s, motion.position.t_s
     if min(command.size, position.size) < 2:
@@ -164,7 +164,7 @@ def _late_or_opposite(course: Course, exposure: Exposure) -> str:
 
 def _faults(
     course: Course,
-    driven: Sequence[JointMotion],
+    driven: Sequence[RecordedJoint],
     exposure: Exposure,
     stillness: Stillness,
     *,
@@ -220,7 +220,7 @@ def _faults(
 
 def _naming(
     course: Course,
-    driven: Sequence[JointMotion],
+    driven: Sequence[RecordedJoint],
     exposure: Exposure,
     faults: Mapping[str, Fault],
 ) -> tuple[str, dict[str, Fault]]:
@@ -239,16 +239,16 @@ def _naming(
         return "", {}
     naming = permutation_of(course.command.T, course.position.T, course.step_s)
     names = [motion.name for motion in driven]
-    if naming.verdict is Verdict.EITHER:
+    if naming.verdict is NamingVerdict.EITHER:
         named = [
             alternative.delay_s
             for alternative in naming.alternatives
-            if alternative.kind is Kind.AS_NAMED
+            if alternative.kind is ExplanationKind.AS_NAMED
         ]
         # Lags that servos have are no reason to doubt the names.
         usual = named and min(named) <= LATEST_S
         return "" if usual or _explain_more(exposure, naming) else in_words(naming, names), {}
-    if naming.verdict is not Verdict.PERMUTED or naming.permutation is None:
+    if naming.verdict is not NamingVerdict.PERMUTED or naming.permutation is None:
         return "", {}
     swapped = {
         names[k]: _whole(driven[k], ("swapped",), f"carries out the command of {names[j]}")
@@ -265,7 +265,7 @@ def _explain_more(exposure: Exposure, naming: Naming) -> bool:
     for them can't be told apart.
     """
     for alternative in naming.alternatives:
-        if alternative.kind is Kind.PERMUTED:
+        if alternative.kind is ExplanationKind.PERMUTED:
             moved = [k for k, j in enumerate(alternative.permutation) if k != j]
             own = [exposure.responses[k] for k in moved]
             if len(moved) < WHOLE * len(alternative.permutation) or not all(map(responds, own)):
@@ -379,12 +379,12 @@ def _stood(spans: Sequence[Span], course: Course, k: int, exposure: Exposure) ->
     return f"stands still while its command moves, {size}"
 
 
-def _whole(motion: JointMotion, kinds: tuple[str, ...], evidence: str) -> Fault:
+def _whole(motion: RecordedJoint, kinds: tuple[str, ...], evidence: str) -> Fault:
     return Fault(motion.name, kinds, (), None, None, 1.0, evidence)
 
 
 def _fault(
-    motion: JointMotion, kinds: tuple[str, ...], spans: tuple[Span, ...], share: float, text: str
+    motion: RecordedJoint, kinds: tuple[str, ...], spans: tuple[Span, ...], share: float, text: str
 ) -> Fault:
     """Build a fault; one that holds throughout has no times."""
     if share > WHOLE and len(spans) == 1:
@@ -413,7 +413,7 @@ def _ends(course: Course, exposure: Exposure, jump: Jump) -> bool:
     return bool(np.std(design @ factors) < QUARTER * np.std(healthy[inside]))
 
 
-def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Fault:
+def _ended(motion: RecordedJoint, jump: Jump, like: Sequence[RecordedJoint]) -> Fault:
     """Return the fault of a joint whose motion nearly ends at a time."""
     end = float(motion.position.t_s[-1])
     span = jump.first_s, min(jump.last_s, end)
@@ -425,9 +425,11 @@ def _ended(motion: JointMotion, jump: Jump, like: Sequence[JointMotion]) -> Faul
     return Fault(motion.name, kinds, (span,), span[0], until, min(share, 1.0), evidence)
 
 
-def _change(names: Sequence[str], jump: Jump) -> Change:
+def _change(names: Sequence[str], jump: Jump) -> ResponseChange:
     size = float(np.exp(jump.change)) if jump.quantity == "noise" else jump.change
     until = jump.last_s if isfinite(jump.last_s) else None
     onset = jump.first_s - jump.block_s, jump.first_s + jump.block_s
     half_width = WIDTH * jump.error
-    return Change(names[jump.joint], jump.quantity, size, half_width, jump.first_s, until, onset)
+    return ResponseChange(
+        names[jump.joint], jump.quantity, size, half_width, jump.first_s, until, onset
+    )

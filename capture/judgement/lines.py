@@ -49,7 +49,7 @@ HARMONICS = 10
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """A motion at one frequency that is no response to the command.
 
     Attributes:
@@ -63,7 +63,7 @@ class Line:
     amplitude_rad: float
 
 
-def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Line]:
+def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[SpectralLine]:
     """Find the largest line of each joint that like joints don't have.
 
     In the whole record, and else in either half: what comes or goes is no line of the whole.
@@ -74,7 +74,7 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     begun = int(np.median(np.argmax(usable, axis=1)))
     end = usable.shape[1]
     middle = (begun + end) // 2
-    lines: dict[int, Line] = {}
+    lines: dict[int, SpectralLine] = {}
     for first, last in ((begun, end), (begun, middle), (middle, end)):
         if last - first >= FEWEST:
             for line in _lines(course, exposure, usable, slice(first, last)):
@@ -82,7 +82,9 @@ def find_lines(course: Course, exposure: Exposure, usable: BoolArray) -> list[Li
     return [lines[k] for k in sorted(lines)]
 
 
-def _lines(course: Course, exposure: Exposure, usable: BoolArray, part: slice) -> list[Line]:
+def _lines(
+    course: Course, exposure: Exposure, usable: BoolArray, part: slice
+) -> list[SpectralLine]:
     """Return the largest line of each joint in a part of the record."""
     usable = usable[:, part]
     count, size = usable.shape
@@ -103,7 +105,7 @@ def _lines(course: Course, exposure: Exposure, usable: BoolArray, part: slice) -
             for values, other in zip((amplitude, error, tail), found, strict=True):
                 values[k, slow] = other[slow]
     tests = 2 * count * course.t_s.size  # of the whole record and of its halves
-    lines: list[Line] = []
+    lines: list[SpectralLine] = []
     for k in range(count):
         others = [j for j in exposure.group(k) if j != k]
         common = np.zeros(frequency.size)
@@ -127,7 +129,7 @@ def _lines(course: Course, exposure: Exposure, usable: BoolArray, part: slice) -
                 residual[k], float(frequency[best]) * course.step_s, tapers[best]
             )
         if size_rad + WIDTH * float(error[k, best]) > COVERAGE * least[best]:
-            lines.append(Line(k, float(frequency[best]), size_rad))
+            lines.append(SpectralLine(k, float(frequency[best]), size_rad))
     return lines
 
 

@@ -50,7 +50,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class JointMotion:
+class RecordedJoint:
     """What was recorded of one joint; None for a quantity that was not.
 
     Attributes:
@@ -98,7 +98,7 @@ class Course:
     step_s: float
 
 
-def course_of(motions: Sequence[JointMotion]) -> Course | None:
+def course_of(motions: Sequence[RecordedJoint]) -> Course | None:
     """Bring joints to common steps: the finest median sampling interval of their positions.
 
     Args:
@@ -129,7 +129,7 @@ def course_of(motions: Sequence[JointMotion]) -> Course | None:
     )
 
 
-def _present(motion: JointMotion, t_s: FloatArray, step_s: float) -> BoolArray:
+def _present(motion: RecordedJoint, t_s: FloatArray, step_s: float) -> BoolArray:
     """Mark the steps with a sample nearby, within the time in which the joint was commanded."""
     samples = motion.position.t_s
     following = np.searchsorted(samples, t_s).clip(1, samples.size - 1)

@@ -56,7 +56,7 @@ NAMED = 4
 """Joints that a clause names at most, as a sentence of the answer does."""
 
 
-class Verdict(StrEnum):
+class NamingVerdict(StrEnum):
     """What commands and positions say of the names."""
 
     FITS = "fits"
@@ -65,7 +65,7 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-class Kind(StrEnum):
+class ExplanationKind(StrEnum):
     """Kinds of explanation."""
 
     AS_NAMED = "as named"
@@ -84,7 +84,7 @@ class Explanation:
         explained: Share of each joint's variance that it explains, 0 to 1, shape (m,).
     """
 
-    kind: Kind
+    kind: ExplanationKind
     permutation: tuple[int, ...]
     delay_s: float
     explained: FloatArray
@@ -106,7 +106,7 @@ class Naming:
         interchangeable: Sets of joints whose commands are alike: among them nothing can be told.
     """
 
-    verdict: Verdict
+    verdict: NamingVerdict
     alternatives: tuple[Explanation, ...] = ()
     decided_by: tuple[int, ...] = ()
     interchangeable: tuple[tuple[int, ...], ...] = ()
@@ -133,24 +133,24 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
     """
     pairs = explained_pairs(commands, positions, step_s)
     if pairs is None:
-        return Naming(Verdict.UNKNOWN)
+        return Naming(NamingVerdict.UNKNOWN)
     alike = _interchangeable(commands)
     named, *others = _candidates(pairs)
     best = _simplest(pairs, named, others)
     if np.count_nonzero(best.explained >= FOLLOWS) < HALF * np.count_nonzero(pairs.judged):
-        return Naming(Verdict.UNKNOWN, interchangeable=alike)
+        return Naming(NamingVerdict.UNKNOWN, interchangeable=alike)
     turned = _inverted(pairs, named, range(pairs.judged.size))
     if turned.delay_s <= best.delay_s and _as_good(turned, best):
-        return Naming(Verdict.FITS, (turned,), (), alike)  # one sign for all is simpler
+        return Naming(NamingVerdict.FITS, (turned,), (), alike)  # one sign for all is simpler
     if best is not named:
         return _permuted(pairs, named, best, alike)
     at_once = np.diagonal(pairs.explained[0])[pairs.judged]
     if np.median(at_once) >= FOLLOWS:
-        return Naming(Verdict.FITS, (named,), (), alike)
+        return Naming(NamingVerdict.FITS, (named,), (), alike)
     # The lag as named is large: names that are shifted would leave a smaller one.
     shifted = [shift for shift in _shifts(pairs) if shift.delay_s < named.delay_s]
     earlier = sorted((one for one in shifted if _as_good(one, named)), key=lambda one: one.delay_s)
-    verdict = Verdict.EITHER if earlier else Verdict.FITS
+    verdict = NamingVerdict.EITHER if earlier else NamingVerdict.FITS
     return Naming(verdict, (*earlier, named), (), alike)
 
 
@@ -161,7 +161,7 @@ def _permuted(
     loss = best.explained - named.explained
     moved = np.array(best.moved)
     follow = moved[best.explained[moved] >= FOLLOWS]
-    fits = Naming(Verdict.FITS, (named,), (), alike)
+    fits = Naming(NamingVerdict.FITS, (named,), (), alike)
     if follow.size < max(2, WHOLE * moved.size) or np.any(loss <= -DECIDES):
         return fits
     decided_by = _deciding(best, named)
@@ -185,9 +185,9 @@ def _permuted(
     else:
         alone = True
     if alone:
-        rivals.append(replace(named, kind=Kind.OWN_LAGS))
+        rivals.append(replace(named, kind=ExplanationKind.OWN_LAGS))
     standing = sorted((best, *rivals), key=lambda one: one.delay_s)
-    verdict = Verdict.EITHER if rivals else Verdict.PERMUTED
+    verdict = NamingVerdict.EITHER if rivals else NamingVerdict.PERMUTED
     return Naming(verdict, tuple(standing), decided_by, alike)
 
 
@@ -292,7 +292,7 @@ def _explanation(pairs: Pairs, order: Sequence[int]) -> Explanation:
     joints = list(range(pairs.judged.size))
     shares: FloatArray = pairs.explained[:, joints, list(order)]
     best = int(np.argmax(shares.sum(axis=1)))
-    kind = Kind.AS_NAMED if list(order) == joints else Kind.PERMUTED
+    kind = ExplanationKind.AS_NAMED if list(order) == joints else ExplanationKind.PERMUTED
     return Explanation(kind, tuple(order), float(pairs.delay_s[best]), shares[best])
 
 
@@ -302,7 +302,9 @@ def _inverted(pairs: Pairs, named: Explanation, which: Iterable[int]) -> Explana
     shares: FloatArray = pairs.explained[:, joints, joints]
     shares[:, turned] = pairs.opposite[:, turned, turned]
     at = int(np.argmax(shares.sum(axis=1)))
-    return Explanation(Kind.INVERTED, named.permutation, float(pairs.delay_s[at]), shares[at])
+    return Explanation(
+        ExplanationKind.INVERTED, named.permutation, float(pairs.delay_s[at]), shares[at]
+    )
 
 
 def _interchangeable(commands: FloatArray) -> tuple[tuple[int, ...], ...]:
@@ -332,17 +334,17 @@ def in_words(naming: Naming, names: Sequence[str]) -> str:
     Returns:
         Clauses with "or" between them; empty where the names fit or nothing can be told.
     """
-    if naming.verdict not in (Verdict.PERMUTED, Verdict.EITHER):
+    if naming.verdict not in (NamingVerdict.PERMUTED, NamingVerdict.EITHER):
         return ""
     decided = naming.decided_by or next((a.moved for a in naming.alternatives if a.moved), ())
     several = some_names([names[k] for k in decided], NAMED)
     clauses: list[str] = []
     for alternative in naming.alternatives:
-        if alternative.kind is Kind.AS_NAMED:
+        if alternative.kind is ExplanationKind.AS_NAMED:
             clauses.append(f"all joints lag by {alternative.delay_s:.3g} s")
-        elif alternative.kind is Kind.INVERTED:
+        elif alternative.kind is ExplanationKind.INVERTED:
             clauses.append(f"inverted: {several}")
-        elif alternative.kind is Kind.OWN_LAGS:
+        elif alternative.kind is ExplanationKind.OWN_LAGS:
             clauses.append(f"another lag or gain than the other joints have: {several}")
         else:
             clauses.append(_order_in_words(alternative.permutation, names))

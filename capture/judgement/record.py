@@ -22,7 +22,7 @@ from .levels import (
     NEGLIGIBLE,
     RARE,
 )
-from .motion import JointMotion
+from .motion import RecordedJoint
 
 STALE = 0.15
 """Share of the fast samples that may repeat the one before, beyond what all joints do: a bus that
@@ -33,11 +33,11 @@ FEW = 1 - FOLLOWS
 """Share of the samples that may be steps of a counter, and largest step of the command in one."""
 
 
-def record_faults(motions: Sequence[JointMotion]) -> dict[str, Fault]:
+def record_faults(motions: Sequence[RecordedJoint]) -> dict[str, Fault]:
     """Find joints whose positions are missing, repeated or off by turns, by name."""
     sampled = [motion for motion in motions if motion.position.t_s.size > 2]
 
-    def counts(motion: JointMotion) -> tuple[float, int, int, str]:
+    def counts(motion: RecordedJoint) -> tuple[float, int, int, str]:
         return _lost(motion), *_repeats(motion), _wraps(motion)
 
     total = sum(motion.position.t_s.size for motion in sampled)
@@ -68,7 +68,7 @@ def _whole(name: str, kinds: tuple[str, ...], text: str, spans: tuple[Span, ...]
     return Fault(name, kinds, spans, since, until, 1.0, text)
 
 
-def _lost(motion: JointMotion) -> float:
+def _lost(motion: RecordedJoint) -> float:
     """Share of the samples that are missing or not finite."""
     samples = motion.position
     step, usual = np.diff(samples.t_s), samples.period_s
@@ -81,7 +81,7 @@ def _lost(motion: JointMotion) -> float:
     return absent / (samples.t_s.size + absent)
 
 
-def _silences(motion: JointMotion, missing: float) -> tuple[Span, ...]:
+def _silences(motion: RecordedJoint, missing: float) -> tuple[Span, ...]:
     """Return the gaps if a few long ones hold most missing samples; else none."""
     t_s = motion.position.t_s
     step = np.diff(t_s)
@@ -92,7 +92,7 @@ def _silences(motion: JointMotion, missing: float) -> tuple[Span, ...]:
     return tuple(zip(t_s[long].tolist(), t_s[long + 1].tolist(), strict=True))
 
 
-def _repeats(motion: JointMotion) -> tuple[int, int]:
+def _repeats(motion: RecordedJoint) -> tuple[int, int]:
     """Count the samples during fast motion that repeat the one before, and all of them."""
     values = motion.position.values
     step = np.abs(np.diff(values))
@@ -112,7 +112,7 @@ def _repeats(motion: JointMotion) -> tuple[int, int]:
     return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))
 
 
-def _wraps(motion: JointMotion) -> str:
+def _wraps(motion: RecordedJoint) -> str:
     """Describe the steps of a counter that wraps around, if there are such.
 
     They have one size, within which the joint stays, go up and down, and are larger than the

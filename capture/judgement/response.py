@@ -63,7 +63,7 @@ FIT_STEPS = 1 << 13
 
 
 @dataclass(frozen=True)
-class Response:
+class JointResponse:
     """Equation (1) for one joint.
 
     Attributes:
@@ -90,7 +90,7 @@ class Response:
         return self.delay_s + self.constant_s * (0, 1, 2 * self.damping)[self.order]
 
 
-USUAL = Response(constant_s=QUARTER * SLOWEST_S, order=1)
+USUAL = JointResponse(constant_s=QUARTER * SLOWEST_S, order=1)
 """What a servo of a bandwidth of 1.6 Hz makes of a command: what is faster hardly moves it, and
 doesn't make blocks."""
 
@@ -112,11 +112,11 @@ class Filtered:
         self._spectrum = np.fft.rfft(np.pad(command, ((0, 0), (self._pad, after)), mode="edge"))
         self._turn = 2j * np.pi * np.fft.rfftfreq(self._size, step_s)
 
-    def output(self, response: Response) -> FloatArray:
+    def output(self, response: JointResponse) -> FloatArray:
         """Return x of equation (1), shape (p, n)."""
         return self.outputs([response])[0]
 
-    def outputs(self, responses: Sequence[Response]) -> FloatArray:
+    def outputs(self, responses: Sequence[JointResponse]) -> FloatArray:
         """Return x of equation (1) for r responses, shape (r, p, n)."""
         delay = np.array([[r.delay_s] for r in responses])
         first = np.array([[r.constant_s * (0, 1, 2 * r.damping)[r.order]] for r in responses])
@@ -131,7 +131,7 @@ class Filtered:
 
 def fit_response(
     command: FloatArray, position: FloatArray, present: BoolArray, step_s: float
-) -> Response:
+) -> JointResponse:
     """Fit equation (1).
 
     Args:
@@ -230,16 +230,16 @@ def _bounds(command: FloatArray, step_s: float) -> tuple[float, float]:
     return min(LATEST_S, QUARTER * cycle), min(SLOWEST_S, cycle / (2 * np.pi))
 
 
-def _grids(latest_s: float, slowest_s: float) -> tuple[list[Response], ...]:
+def _grids(latest_s: float, slowest_s: float) -> tuple[list[JointResponse], ...]:
     """Return the responses that the search begins with, by their order."""
     delays = np.linspace(0, latest_s, SEARCH).tolist()
     constants = [slowest_s / 2**k for k in range(SEARCH)]
     few = delays[:: SEARCH // 2]
     return (
-        [Response(delay_s=delay) for delay in delays],
-        [Response(1.0, 0.0, delay, constant, 1) for delay in few for constant in constants],
+        [JointResponse(delay_s=delay) for delay in delays],
+        [JointResponse(1.0, 0.0, delay, constant, 1) for delay in few for constant in constants],
         [
-            Response(1.0, 0.0, delay, constant / 2, 2, damping)
+            JointResponse(1.0, 0.0, delay, constant / 2, 2, damping)
             for delay in few
             for constant in constants
             for damping in DAMPINGS
@@ -247,7 +247,7 @@ def _grids(latest_s: float, slowest_s: float) -> tuple[list[Response], ...]:
     )
 
 
-_Fit = tuple[float, Response, FloatArray]
+_Fit = tuple[float, JointResponse, FloatArray]
 """Trimmed squares, the response, and the blocks that were kept, shape (b,)."""
 
 
@@ -257,9 +257,11 @@ def _merit(fit: _Fit) -> tuple[float, int, float]:
     return squares, response.order, response.delay_s
 
 
-def _moved(centre: Response, step_s: float, latest_s: float, slowest_s: float) -> list[Response]:
+def _moved(
+    centre: JointResponse, step_s: float, latest_s: float, slowest_s: float
+) -> list[JointResponse]:
     """Return the neighbours of a response, a step of delay or time constant away."""
-    responses: list[Response] = []
+    responses: list[JointResponse] = []
     for k in (-1, 0, 1):
         for j in (-1, 0, 1) if centre.order else (0,):
             delay = min(max(centre.delay_s + k * step_s, 0.0), latest_s)
@@ -304,7 +306,10 @@ class _Trimmed:
         self._starts = starts
 
     def best(
-        self, outputs: FloatArray, responses: Sequence[Response], keep: FloatArray | None = None
+        self,
+        outputs: FloatArray,
+        responses: Sequence[JointResponse],
+        keep: FloatArray | None = None,
     ) -> _Fit:
         """Fit gain and offset of r responses, from all starts or from a neighbour's blocks.
 
@@ -341,7 +346,7 @@ class _Trimmed:
         return least, full, chosen
 
     def step(
-        self, output: FloatArray, slopes: FloatArray, centre: Response, keep: FloatArray
+        self, output: FloatArray, slopes: FloatArray, centre: JointResponse, keep: FloatArray
     ) -> list[float]:
         """Return the step of Gauss and Newton over the kept blocks.
 

@@ -16,7 +16,7 @@ from ..log.read.session_view import SessionView
 from ..robot.model import Joint, Seat
 from .fault import Judgement
 from .judge import judge
-from .motion import JointMotion, Samples
+from .motion import RecordedJoint, Samples
 from .publishers import are_of_two_nodes
 
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
@@ -83,7 +83,7 @@ def motions_of(
     columns: Mapping[str, Mapping[str, Signal]],
     names: Iterable[str],
     window_ns: tuple[int, int] | None = None,
-) -> list[JointMotion]:
+) -> list[RecordedJoint]:
     """Take the recorded signals of joints, times from the session's start.
 
     Args:
@@ -96,7 +96,7 @@ def motions_of(
     """
     robot = session.robot
     described = {} if robot is None else {joint.name: joint for joint in robot.joints}
-    motions: list[JointMotion] = []
+    motions: list[RecordedJoint] = []
     for name in names:
         times = _Times(session.start_ns, window_ns)
         signals = {key: times.samples(columns.get(key, {}).get(name)) for key in QUANTITIES}
@@ -104,7 +104,7 @@ def motions_of(
             continue
         joint = described.get(name)
         motions.append(
-            JointMotion(
+            RecordedJoint(
                 name=name,
                 command=command,
                 position=signals["position"] or _EMPTY,

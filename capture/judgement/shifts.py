@@ -48,7 +48,7 @@ class Shift:
 
 
 @dataclass(frozen=True)
-class Noise:
+class ShiftNoise:
     """The noise of equation (1).
 
     Attributes:
@@ -60,11 +60,11 @@ class Noise:
     freedom: float
 
 
-UNKNOWN = Noise(0.0, 0.0)
+UNKNOWN = ShiftNoise(0.0, 0.0)
 """Of joints that have no like ones."""
 
 
-def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> Noise:
+def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> ShiftNoise:
     """Return the noise of one series of shape (b,), whether or not its level shifts.
 
     A shift is in one difference of neighbours alone. Half the mean square of all is the variance,
@@ -77,10 +77,10 @@ def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> Noise:
     scale = np.sqrt(weights[known])
     whole, target = _whitened(scale, rho), _whitened(scale * values[known], rho)
     steps = np.diff(target - float(whole @ target) / float(whole @ whole) * whole)
-    return Noise(max(float(np.mean(steps**2)) / 2, TINY), WHOLE * steps.size)
+    return ShiftNoise(max(float(np.mean(steps**2)) / 2, TINY), WHOLE * steps.size)
 
 
-def common_noise(noises: Sequence[Noise], own: Noise = UNKNOWN) -> Noise:
+def common_noise(noises: Sequence[ShiftNoise], own: ShiftNoise = UNKNOWN) -> ShiftNoise:
     """Estimate the noise of a joint from that of several like it (Smyth, section 6.2).
 
     The joints' own scatter is taken at its upper limit of 90 %; that of few joints weighs little,
@@ -101,7 +101,7 @@ def common_noise(noises: Sequence[Noise], own: Noise = UNKNOWN) -> Noise:
     freedom = pooled if excess <= 0 else min(pooled, (1 + np.sqrt(1 + 2 * excess)) / excess)
     variance = float(np.exp(middle + digamma(freedom / 2) - np.log(freedom / 2)))
     beyond = own.variance > variance * float(fdtri(max(own.freedom, 1), freedom, 1 - LEVEL))
-    return UNKNOWN if beyond else Noise(variance, float(freedom))
+    return UNKNOWN if beyond else ShiftNoise(variance, float(freedom))
 
 
 def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
@@ -164,7 +164,7 @@ def largest_shift(
     shortest: int,
     *,
     compared: bool,
-    like: Noise = UNKNOWN,
+    like: ShiftNoise = UNKNOWN,
 ) -> Shift | None:
     """Return the most certain run of blocks, or None if none is beyond the level.
 
@@ -286,7 +286,7 @@ def _fitted(
     last: IntArray,
     rho: float,
     *,
-    like: Noise = UNKNOWN,
+    like: ShiftNoise = UNKNOWN,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return c and m of equation (1), and the standard error of c, of runs."""
     scale = np.sqrt(w)
@@ -317,7 +317,7 @@ def _plain_error(
     last: IntArray,
     rho: float,
     *,
-    like: Noise = UNKNOWN,
+    like: ShiftNoise = UNKNOWN,
 ) -> FloatArray:
     """Return the standard error of the difference of means in and out of runs."""
     sums = np.pad(np.cumsum([w, w * v, w * v**2], axis=1), ((0, 0), (1, 0)))

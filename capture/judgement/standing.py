@@ -14,7 +14,7 @@ import numpy as np
 from ..common.arrays import BoolArray, FloatArray
 from .fault import Span
 from .levels import GAIN_MARGIN, HALF, QUARTER, TINY
-from .motion import JointMotion, Samples
+from .motion import RecordedJoint, Samples
 
 NEAR_LIMIT = GAIN_MARGIN
 """Share of a joint's range within which it is at its limit."""
@@ -33,7 +33,7 @@ PUSHES = 1.5
 
 
 def standing_kinds(
-    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion]
+    motion: RecordedJoint, spans: Sequence[Span], like: Sequence[RecordedJoint]
 ) -> tuple[tuple[str, ...], str]:
     """Return the kinds that fit a joint that stands still, and what decides.
 
@@ -62,7 +62,7 @@ def standing_kinds(
 
 
 def _by_effort(
-    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion], kinds: list[str]
+    motion: RecordedJoint, spans: Sequence[Span], like: Sequence[RecordedJoint], kinds: list[str]
 ) -> tuple[list[str], str]:
     """Return the kinds that the effort leaves of those that fit, and what decides."""
     size = _effort(motion, spans, like)
@@ -81,7 +81,7 @@ def _by_effort(
     return driven or kinds, f"its effort is {size:.1f} times the usual one"
 
 
-def opposite_kinds(motion: JointMotion) -> tuple[tuple[str, ...], str]:
+def opposite_kinds(motion: RecordedJoint) -> tuple[tuple[str, ...], str]:
     """Return the kinds that fit a joint that moves against its command, and what decides."""
     t_s, position = motion.position.t_s, motion.position.values
     if motion.reference is not None and motion.reference.t_s.size > AGAIN:
@@ -144,7 +144,7 @@ def _moves(
 
 
 def _effort(
-    motion: JointMotion, spans: Sequence[Span], like: Sequence[JointMotion]
+    motion: RecordedJoint, spans: Sequence[Span], like: Sequence[RecordedJoint]
 ) -> float | None:
     """Return the mean size of the effort while a joint stands, in the usual one.
 
@@ -179,7 +179,7 @@ def _size(effort: Samples | None, spans: Sequence[Span], *, inside: bool) -> flo
     return float(np.mean(np.abs(values))) if values.size > AGAIN else None
 
 
-def _at_limit(motion: JointMotion, inside: BoolArray, spans: Sequence[Span]) -> bool:
+def _at_limit(motion: RecordedJoint, inside: BoolArray, spans: Sequence[Span]) -> bool:
     """Return whether a joint stands at a limit, or again and again at one end of its motion."""
     values = motion.position.values
     if not inside.any():

@@ -36,7 +36,7 @@ from .live_wire import (
     MAX_MESSAGE,
     RECORD_SIZE,
     DatagramHead,
-    Kind,
+    DatagramKind,
     LiveDefinitions,
     Queued,
     pack_datagram,
@@ -227,7 +227,7 @@ class LiveFeed:
         if self._socket is not None:
             if isinstance(record, Channel) and record.id in self._definitions.periods:
                 self._due[record.id] = 0
-            self._unsent_definitions.append(self._pack(Kind.DEFINITIONS, [packed]))
+            self._unsent_definitions.append(self._pack(DatagramKind.DEFINITIONS, [packed]))
 
     def offer(self, *message: *MessageFields) -> None:
         """Queue a message if a relay was found; see :meth:`MessageSink.write`."""
@@ -280,14 +280,14 @@ class LiveFeed:
         for _ in range(_END_TRIES):
             while self._send_one():
                 pass
-            if not self.connected or (self._is_empty and self._taken(self._pack(Kind.END))):
+            if not self.connected or (self._is_empty and self._taken(self._pack(DatagramKind.END))):
                 break
             time.sleep(_END_PAUSE_S)
         self._lose(self._clock())
         self._renew_at_ns = _NEVER_NS
 
-    def _pack(self, kind: Kind, records: Sequence[bytes] = ()) -> _Packed:
-        messages = len(records) if kind is Kind.MESSAGES else 0
+    def _pack(self, kind: DatagramKind, records: Sequence[bytes] = ()) -> _Packed:
+        messages = len(records) if kind is DatagramKind.MESSAGES else 0
         head = DatagramHead(kind, messages, self._feed_id, self.counts.dropped)
         return _Packed(pack_datagram(head, records), messages)
 
@@ -332,7 +332,7 @@ class LiveFeed:
             records.append(pack_message(self._queue.popleft()))
             size += length
         self._queued_bytes -= size
-        return self._pack(Kind.MESSAGES, records)
+        return self._pack(DatagramKind.MESSAGES, records)
 
     # -- the socket ------------------------------------------------------------------------
 
@@ -379,7 +379,8 @@ class LiveFeed:
             self._due = dict.fromkeys(self._periods, 0)
         if not self._unsent_definitions:
             self._unsent_definitions.extend(
-                self._pack(Kind.DEFINITIONS, group) for group in self._definitions.groups(_DATAGRAM)
+                self._pack(DatagramKind.DEFINITIONS, group)
+                for group in self._definitions.groups(_DATAGRAM)
             )
 
     def _lose(self, now_ns: int) -> None:

@@ -61,7 +61,7 @@ _STATES = {"std_msgs/msg/String"}
 """Types published on change, whose last message is sent to a new relay."""
 
 
-class Kind(IntEnum):
+class DatagramKind(IntEnum):
     """Content of a datagram."""
 
     MESSAGES = 0
@@ -100,7 +100,7 @@ class DatagramHead(NamedTuple):
         dropped: Number of messages that the feed has dropped so far.
     """
 
-    kind: Kind
+    kind: DatagramKind
     messages: int
     feed_id: int
     dropped: int
@@ -137,9 +137,9 @@ def read_head(data: bytes) -> DatagramHead:
     if len(data) < HEAD_SIZE:
         raise DataError(f"a datagram of {len(data)} bytes is too short for the live feed")
     magic, version, kind, messages, feed_id, dropped = _HEAD.unpack_from(data)
-    if magic != _MAGIC or version != _VERSION or kind not in Kind.__members__.values():
+    if magic != _MAGIC or version != _VERSION or kind not in DatagramKind.__members__.values():
         raise DataError("a datagram is not of this version's live feed")
-    return DatagramHead(Kind(kind), messages, feed_id, dropped)
+    return DatagramHead(DatagramKind(kind), messages, feed_id, dropped)
 
 
 def read_records(data: bytes) -> list[LiveMessage | Definition]:

@@ -77,7 +77,7 @@ class TappedSink:
         self._sink.close(last)
 
 
-class Recording:
+class RunningRecording:
     """A running recording, and the actions that its control socket offers."""
 
     def __init__(

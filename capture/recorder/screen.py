@@ -23,7 +23,7 @@ from rich.text import Text
 
 from ..common.amounts import format_size
 from ..common.arrays import NS
-from ..common.console import Cells, Column, cut, fit, plain, table
+from ..common.console import Cells, TerminalColumn, cut, fit, plain, table
 from ..log.health.findings import WAITS_FOR_COMMANDS
 from ..log.health.rules import has_rhythm
 from ..log.messages.definitions import ERROR, OK
@@ -49,28 +49,28 @@ _DASH = "-"
 
 
 SOURCE_COLUMNS = (
-    Column("source", 10, left=True),
-    Column("state", 16, left=True),
-    Column("frames/s", 8),
-    Column("lost", 6),
-    Column("unread", 6),
-    Column("load", 5),
-    Column("drift/ppm", 9),
-    Column("jitter/ms", 9),
-    Column("frames", 11, spare=1),
-    Column("bus errors", 10, spare=1),
-    Column("reconnects", 10, spare=1),
+    TerminalColumn("source", 10, left=True),
+    TerminalColumn("state", 16, left=True),
+    TerminalColumn("frames/s", 8),
+    TerminalColumn("lost", 6),
+    TerminalColumn("unread", 6),
+    TerminalColumn("load", 5),
+    TerminalColumn("drift/ppm", 9),
+    TerminalColumn("jitter/ms", 9),
+    TerminalColumn("frames", 11, spare=1),
+    TerminalColumn("bus errors", 10, spare=1),
+    TerminalColumn("reconnects", 10, spare=1),
 )
 TOPIC_COLUMNS = (
-    Column("topic", 16, left=True),
-    Column("msgs/s", 8),
-    Column("age/s", 6),
-    Column("gaps", 5),
-    Column("missing", 7),
-    Column("jitter", 6),
-    Column("lost", 6),
-    Column("messages", 10, spare=1),
-    Column("joints", 20, left=True, spare=1),
+    TerminalColumn("topic", 16, left=True),
+    TerminalColumn("msgs/s", 8),
+    TerminalColumn("age/s", 6),
+    TerminalColumn("gaps", 5),
+    TerminalColumn("missing", 7),
+    TerminalColumn("jitter", 6),
+    TerminalColumn("lost", 6),
+    TerminalColumn("messages", 10, spare=1),
+    TerminalColumn("joints", 20, left=True, spare=1),
 )
 
 LINE_EVERY_S = 10.0

@@ -72,7 +72,7 @@ _DELAYS = 4096
 
 
 @dataclass(frozen=True)
-class Line:
+class ClockLine:
     """Difference between host and device time: ``offset_ns + rate * (device - origin)``.
 
     Attributes:
@@ -102,7 +102,7 @@ class Envelope:
             rate: Expected rate.
             sigma: Its standard deviation.
         """
-        self.line = Line(0.0, rate, sigma, 0.0)
+        self.line = ClockLine(0.0, rate, sigma, 0.0)
         self._prior = (rate, sigma)
         self._points: deque[tuple[float, float]] = deque(maxlen=BUCKETS)
         self._least: tuple[float, float] | None = None  # of the bucket that is open
@@ -122,12 +122,12 @@ class Envelope:
         line = self.line
         height = y - line.offset_ns - line.rate * x
         if self.empty:
-            self.line = Line(line.offset_ns + height, *_rest(line))
+            self.line = ClockLine(line.offset_ns + height, *_rest(line))
         elif height < 0.0:
             step = max(STEP_NS, STEP_SPREADS * line.spread_ns)
             if -height > step and len(self._points) >= STEP_BUCKETS:
                 self._drop_before(0)
-            self.line = Line(line.offset_ns + height, *_rest(self.line))
+            self.line = ClockLine(line.offset_ns + height, *_rest(self.line))
         least = self._least
         if least is None or y - line.rate * x < least[1] - line.rate * least[0]:
             self._least = (x, y)
@@ -158,7 +158,7 @@ class Envelope:
         while len(self._points) > kept:
             self._points.popleft()
         self._least = self._least if kept else None
-        self.line = Line(line.offset_ns, line.rate, self._prior[1], line.spread_ns)
+        self.line = ClockLine(line.offset_ns, line.rate, self._prior[1], line.spread_ns)
 
     def _fit(self) -> None:
         points = sorted(self._points)
@@ -174,10 +174,10 @@ class Envelope:
             sigma *= (1.0 - weight) ** 0.5
         offset = min(y - rate * x for x, y in points)
         spread = sum(y - offset - rate * x for x, y in points) / count
-        self.line = Line(offset, rate, sigma, spread)
+        self.line = ClockLine(offset, rate, sigma, spread)
 
 
-def _rest(line: Line) -> tuple[float, float, float]:
+def _rest(line: ClockLine) -> tuple[float, float, float]:
     return line.rate, line.uncertainty, line.spread_ns
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from ..common.arrays import FloatArray
 from ..common.config import read_field
 from ..common.errors import UsageError
-from ..common.strict_table import Faults, Table, finite_number, listed
+from ..common.strict_table import Faults, StrictTable, finite_number, listed
 from .families import read_family
 from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
 
@@ -160,7 +160,7 @@ def _messages(text: str) -> tuple[Message, ...]:
 
 
 def read_bus(
-    table: Table,
+    table: StrictTable,
     joints: tuple[Joint, ...],
     sensors: tuple[Sensor, ...],
     read_database: Callable[[str], str | None],
@@ -210,7 +210,7 @@ def read_bus(
 
 
 def _poll(
-    entry: Table, messages: Mapping[str, Message] | None, joints: tuple[Joint, ...]
+    entry: StrictTable, messages: Mapping[str, Message] | None, joints: tuple[Joint, ...]
 ) -> BusPoll:
     """Read a request; its target, if any, only names the joint that it is for."""
     names = [joint.name for joint in joints]
@@ -229,7 +229,7 @@ def _poll(
 
 
 def _message(
-    entry: Table, messages: Mapping[str, Message] | None
+    entry: StrictTable, messages: Mapping[str, Message] | None
 ) -> tuple[str, dict[str, Signal] | None]:
     """Read the name of a message; return it with its signals, None where it is unknown."""
     name = entry.text("message")
@@ -240,7 +240,7 @@ def _message(
     return name, {signal.name: signal for signal in messages[name].signals}
 
 
-def _expanded(entries: Iterable[Table], joints: tuple[Joint, ...]) -> Iterator[Table]:
+def _expanded(entries: Iterable[StrictTable], joints: tuple[Joint, ...]) -> Iterator[StrictTable]:
     """Yield each entry, or one entry a joint where its target is the placeholder."""
     for entry in entries:
         if entry.values.get("target") != _PLACEHOLDER:
@@ -258,7 +258,7 @@ def _expanded(entries: Iterable[Table], joints: tuple[Joint, ...]) -> Iterator[T
 
 
 def _signal(
-    entry: Table,
+    entry: StrictTable,
     messages: Mapping[str, Message] | None,
     joints: tuple[Joint, ...],
     sensors: tuple[Sensor, ...],
@@ -301,7 +301,7 @@ def _signal(
     )
 
 
-def _code(entry: Table, key: str, dbc: Signal | None) -> int | None:
+def _code(entry: StrictTable, key: str, dbc: Signal | None) -> int | None:
     """Read a raw number with a special meaning; None where there is none."""
     if key not in entry:
         return None
@@ -326,7 +326,7 @@ def _quantities(
     return tuple(_OF_SENSOR[sensor.kind] for sensor in sensors if sensor.name == target)
 
 
-def _check_axis(entry: Table, axis: str, sensors: list[Sensor]) -> None:
+def _check_axis(entry: StrictTable, axis: str, sensors: list[Sensor]) -> None:
     """Note an axis that the target does not measure, or one that is missing."""
     axes = sensors[0].axes if sensors else ()
     if axes and axis not in axes:

@@ -35,9 +35,9 @@ from pathlib import Path
 from typing import Any
 
 from ..common.config import read, read_field, read_fields, read_required
-from ..common.errors import Fault, RobotFileError
+from ..common.errors import DescriptionFault, RobotFileError
 from ..common.files import Shelf, check_regular
-from ..common.strict_table import Faults, Table, listed
+from ..common.strict_table import Faults, StrictTable, listed
 from ..common.untrusted_text import read_toml
 from .bus_map import read_bus
 from .kinematics import MESH_TYPES, mesh_type, read_meshes
@@ -69,14 +69,14 @@ def _note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
         faults.add(what, f"{names.count(name)} times {name}", "every name once")
 
 
-def _read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
+def _read_joints(top: StrictTable, defaults: StrictTable) -> tuple[Joint, ...]:
     """Read ``joints``, or a ``chain`` of equal ones, head to tail."""
     common, servo = defaults.table("joint"), defaults.table("servo")
     tables = _chain(top) if "chain" in top else top.tables("joints")
     if not tables:
         top.fault("joints", "an array of at least one table, the joint next to the head first")
 
-    def joint(table: Table) -> Joint:
+    def joint(table: StrictTable) -> Joint:
         return read(table, Joint, servo=lambda: read(table.table("servo", servo), Servo))
 
     joints = tuple(joint(table.over(common)) for table in tables)
@@ -86,7 +86,7 @@ def _read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
     return joints
 
 
-def _chain(top: Table) -> list[Table]:
+def _chain(top: StrictTable) -> list[StrictTable]:
     """Return tables for ``joints`` of a chain that is given by its length."""
     if "joints" in top:
         top.fault("joints", "leave it out: the chain has them")
@@ -109,7 +109,7 @@ def numbered(word: str, count: int) -> list[str]:
     return [f"{word}{i:0{width}d}" for i in range(1, count + 1)]
 
 
-def _read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
+def _read_links(top: StrictTable, defaults: StrictTable, joint_count: int) -> tuple[Link, ...]:
     """Read ``links``, by default one more than joints with default values, head to tail."""
     common = defaults.table("link")
     tables = top.tables("links")
@@ -124,7 +124,7 @@ def _read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ..
     return links
 
 
-def _link(table: Table) -> Link:
+def _link(table: StrictTable) -> Link:
     link = read_fields(table, Link)
     if link.mesh and mesh_type(link.mesh) is None:
         table.fault("mesh", f"a file {listed(MESH_TYPES)}, or leave it out")
@@ -135,7 +135,7 @@ def _link(table: Table) -> Link:
     return link
 
 
-def _read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
+def _read_safety(top: StrictTable, joints: tuple[Joint, ...]) -> Safety | None:
     """Read ``safety``, and ``safety_of`` with the limits of single joints."""
     if "safety" not in top:
         if "safety_of" in top:
@@ -154,7 +154,9 @@ def _read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
     return replace(safety, of=tuple(of))
 
 
-def _read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[Sensor, ...]:
+def _read_sensors(
+    top: StrictTable, defaults: StrictTable, links: tuple[Link, ...]
+) -> tuple[Sensor, ...]:
     """Read ``sensors``, with ``defaults`` of each kind."""
     common = {kind: defaults.table(kind) for kind in SensorKind}
     used: set[SensorKind] = set()
@@ -174,7 +176,7 @@ def _read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple
     return tuple(sensors)
 
 
-def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
+def _sensor(table: StrictTable, kind: SensorKind, link_names: list[str]) -> Sensor:
     ranges = _RANGE_FIELDS if kind in _RANGED else ()
     fields = ("link", "position", "rpy", *(ranges or ("axes",)))
 
@@ -280,7 +282,7 @@ def robot_in_session(
     try:
         text = data.decode()
     except UnicodeDecodeError as error:
-        raise RobotFileError(source, [Fault("text", str(error), "UTF-8")]) from error
+        raise RobotFileError(source, [DescriptionFault("text", str(error), "UTF-8")]) from error
     files = {
         name: content.decode("utf-8", "replace")
         for name, content in attachments.items()
@@ -323,9 +325,11 @@ def _parse(
     try:
         values = read_toml(text)
     except ValueError as error:
-        raise RobotFileError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
+        raise RobotFileError(
+            source, [DescriptionFault("syntax", str(error), "TOML 1.0")]
+        ) from error
     faults = Faults()
-    top = Table(values, "", faults)
+    top = StrictTable(values, "", faults)
     defaults = top.table("defaults")
     name, description = top.name("name"), top.text("description", "")
     serial = top.text("serial", "")

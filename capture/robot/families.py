@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from ..common.config import read
-from ..common.strict_table import Table, listed
+from ..common.strict_table import StrictTable, listed
 from .model import Bus, BusSignal, Direction, Joint, Motor, Quantity
 from .serial_servos import SERVOS
 
@@ -58,7 +58,7 @@ _DEFAULT_BITRATE = 1_000_000
 
 
 @dataclass(frozen=True)
-class Field:
+class SignalField:
     """One signal of a message: DBC bit field, and what it means.
 
     Attributes:
@@ -92,7 +92,7 @@ class Frame:
     name: str
     direction: Direction
     id: int
-    fields: tuple[Field, ...]
+    fields: tuple[SignalField, ...]
     multiplexer: str = ""
     extended: bool = False
     size: int = 8
@@ -119,16 +119,16 @@ def dbc_text(frames: Mapping[str, Frame]) -> str:
     return "\n".join([*lines, "", *extra, ""])
 
 
-def _mapped(name: str, bits: str, most: float, **meaning: object) -> Field:
+def _mapped(name: str, bits: str, most: float, **meaning: object) -> SignalField:
     """Return a number that spans -most to most, both included, as MIT's mini-cheetah has it."""
     length = int(bits[bits.index("|") + 1 : bits.index("@")])
     scale = 2 * most / ((1 << length) - 1)
-    return Field(name, bits, scale=scale, offset=-most, **meaning)  # pyright: ignore[reportArgumentType]
+    return SignalField(name, bits, scale=scale, offset=-most, **meaning)  # pyright: ignore[reportArgumentType]
 
 
 def _state(
     places: tuple[str, str, str], most: tuple[float, float, float], selector: tuple[int, ...] = ()
-) -> tuple[Field, ...]:
+) -> tuple[SignalField, ...]:
     """Return position, velocity and torque, which span -most to most."""
     names = ("position", "velocity", "torque")
     kinds = (Quantity.POSITION, "rad"), (Quantity.VELOCITY, "rad/s"), (Quantity.EFFORT, "N m")
@@ -156,7 +156,7 @@ def _mit_reply(
     own = (motor,)
     fields = (
         *_state(("15|16@0+", "31|12@0+", "35|12@0+"), most, own),
-        Field("temperature", "48|8@1+", Quantity.TEMPERATURE, "degC", 1.0, warmth, own),
+        SignalField("temperature", "48|8@1+", Quantity.TEMPERATURE, "degC", 1.0, warmth, own),
     )
     return Frame("reply", RX, id_, fields, "0|4@1+" if low_nibble else "0|8@1+")
 
@@ -164,7 +164,7 @@ def _mit_reply(
 def damiao(motor: Motor) -> tuple[Frame, ...]:
     """Damiao: MIT mode, position-velocity mode (0x100 + id), replies at the master's identifier."""
     most = _DAMIAO[motor.model]
-    speed = Field("position_command", "0|32@1-", Quantity.COMMAND, "rad", is_float=True)
+    speed = SignalField("position_command", "0|32@1-", Quantity.COMMAND, "rad", is_float=True)
     # Byte 6 is the temperature of the transistors, byte 7 that of the winding.
     reply = _mit_reply(motor.reply_id or 0, motor.id & 0xF, most, low_nibble=True, warmth=0.0)
     return (
@@ -192,8 +192,10 @@ def _robstride(motor: Motor) -> tuple[Frame, ...]:
         "position_command", "7|16@0+", most[0], quantity=Quantity.COMMAND, unit="rad"
     )
 
-    def command(selector: int, quantity: Quantity | None) -> Field:
-        return Field("loc_ref", "32|32@1-", quantity, "rad", selector=(selector,), is_float=True)
+    def command(selector: int, quantity: Quantity | None) -> SignalField:
+        return SignalField(
+            "loc_ref", "32|32@1-", quantity, "rad", selector=(selector,), is_float=True
+        )
 
     return (
         Frame("control", TX, 1 << 24 | motor.id, (position,), extended=True),
@@ -201,7 +203,7 @@ def _robstride(motor: Motor) -> tuple[Frame, ...]:
               extended=True),
         Frame("feedback", RX, 2 << 24 | motor.id << 8, (
             *_state(("7|16@0+", "23|16@0+", "39|16@0+"), most),
-            Field("temperature", "55|16@0+", Quantity.TEMPERATURE, "degC", 0.1),
+            SignalField("temperature", "55|16@0+", Quantity.TEMPERATURE, "degC", 0.1),
         ), extended=True),
     )  # fmt: skip
 
@@ -214,17 +216,20 @@ def rmd(motor: Motor) -> tuple[Frame, ...]:
     """
     old = motor.model == "v2"
     reply = motor.reply_id if motor.reply_id is not None else (0x140 if old else 0x240) + motor.id
-    where = Field("position", "8|56@1-" if old else "32|32@1-", Quantity.POSITION, "deg", 0.01,
+    bits = "8|56@1-" if old else "32|32@1-"
+    where = SignalField("position", bits, Quantity.POSITION, "deg", 0.01,
                   selector=(0x92,))  # fmt: skip
     state = (
-        Field("temperature", "8|8@1-", Quantity.TEMPERATURE, "degC", selector=(0x9A, *_RMD_STATE)),
-        Field("torque_current", "16|16@1-", Quantity.CURRENT, "A", 33 / 2048 if old else 0.01,
+        SignalField(
+            "temperature", "8|8@1-", Quantity.TEMPERATURE, "degC", selector=(0x9A, *_RMD_STATE)
+        ),
+        SignalField("torque_current", "16|16@1-", Quantity.CURRENT, "A", 33 / 2048 if old else 0.01,
               selector=_RMD_STATE),
-        Field("velocity", "32|16@1-", Quantity.VELOCITY, "deg/s", selector=_RMD_STATE),
-        Field("voltage", "24|16@1+" if old else "32|16@1+", Quantity.VOLTAGE, "V", 0.1,
+        SignalField("velocity", "32|16@1-", Quantity.VELOCITY, "deg/s", selector=_RMD_STATE),
+        SignalField("voltage", "24|16@1+" if old else "32|16@1+", Quantity.VOLTAGE, "V", 0.1,
               selector=(0x9A,)),
     )  # fmt: skip
-    command = Field("position_command", "32|32@1-", Quantity.COMMAND, "deg", 0.01,
+    command = SignalField("position_command", "32|32@1-", Quantity.COMMAND, "deg", 0.01,
                     selector=(0xA3, 0xA4) if old else (0xA4,))  # fmt: skip
     return (
         Frame("request", TX, 0x140 + motor.id, (command,), "0|8@1+"),
@@ -235,10 +240,10 @@ def rmd(motor: Motor) -> tuple[Frame, ...]:
 def odrive(motor: Motor) -> tuple[Frame, ...]:
     """ODrive CANSimple: identifier ``node << 5 | command``, IEEE 754, revolutions."""
 
-    def number(name: str, first: int, quantity: Quantity, unit: str) -> Field:
-        return Field(name, f"{first}|32@1-", quantity, unit, is_float=True)
+    def number(name: str, first: int, quantity: Quantity, unit: str) -> SignalField:
+        return SignalField(name, f"{first}|32@1-", quantity, unit, is_float=True)
 
-    def frame(name: str, way: Direction, command: int, *fields: Field) -> Frame:
+    def frame(name: str, way: Direction, command: int, *fields: SignalField) -> Frame:
         return Frame(name, way, motor.id << 5 | command, fields)
 
     return (
@@ -299,7 +304,7 @@ def models_of(family: str) -> tuple[str, ...]:
 
 
 def read_family(
-    table: Table, joints: tuple[Joint, ...], unit_factor: Mapping[str, float]
+    table: StrictTable, joints: tuple[Joint, ...], unit_factor: Mapping[str, float]
 ) -> tuple[Bus, tuple[tuple[str, str], ...]]:
     """Read the ``bus`` table of a family; return it with the databases that it stands for.
 
@@ -329,7 +334,9 @@ def read_family(
     return Bus(names_of, bitrate, signals, family=family, motors=motors), databases
 
 
-def _motors(table: Table, joints: tuple[Joint, ...], models: tuple[str, ...]) -> tuple[Motor, ...]:
+def _motors(
+    table: StrictTable, joints: tuple[Joint, ...], models: tuple[str, ...]
+) -> tuple[Motor, ...]:
     names = [joint.name for joint in joints]
     usual = table.text("model", models[0]) if models else ""
     if models and usual not in models:

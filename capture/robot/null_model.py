@@ -24,9 +24,9 @@ import numpy as np
 
 from ..common.arrays import ComplexArray, FloatArray, frozen
 from ..common.config import Name, NonNegative, Positive, read, read_field, write
-from ..common.errors import Fault, NullModelError
+from ..common.errors import DescriptionFault, NullModelError
 from ..common.files import read_input, write_text
-from ..common.strict_table import Faults, Table
+from ..common.strict_table import Faults, StrictTable
 from ..common.untrusted_text import read_json
 
 FORMAT = "undulog null model 1"
@@ -147,11 +147,13 @@ def read_null_model(path: Path) -> NullModel:
     try:
         values: Any = read_json(read_input(path))
     except ValueError as error:
-        raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
+        raise NullModelError(
+            path, [DescriptionFault("syntax", str(error), "JSON in UTF-8")]
+        ) from error
     if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:
-        raise NullModelError(path, [Fault("format", "no such format", f'"{FORMAT}"')])
+        raise NullModelError(path, [DescriptionFault("format", "no such format", f'"{FORMAT}"')])
     faults = Faults()
-    top = Table(cast("dict[str, Any]", values), "", faults)
+    top = StrictTable(cast("dict[str, Any]", values), "", faults)
     top.text("format")
     gait = top.table("gait")
     joints = gait.words("joints")
@@ -185,13 +187,13 @@ def read_null_model(path: Path) -> NullModel:
     return model
 
 
-def _module(table: Table, m: int) -> tuple[str, ComplexArray]:
+def _module(table: StrictTable, m: int) -> tuple[str, ComplexArray]:
     kind, effect = table.name("kind"), _parts(table, (m, m))
     table.close()
     return kind, effect
 
 
-def _covariance(top: Table, k: int) -> FloatArray:
+def _covariance(top: StrictTable, k: int) -> FloatArray:
     covariance = _array(top, "covariance", (k, k))
     if np.isfinite(covariance).all():
         symmetric = np.allclose(covariance, covariance.T, rtol=1e-9)
@@ -200,14 +202,14 @@ def _covariance(top: Table, k: int) -> FloatArray:
     return covariance
 
 
-def _complex(table: Table, key: str, shape: tuple[int, ...]) -> ComplexArray:
+def _complex(table: StrictTable, key: str, shape: tuple[int, ...]) -> ComplexArray:
     pair = table.table(key)
     y = _parts(pair, shape)
     pair.close()
     return y
 
 
-def _parts(table: Table, shape: tuple[int, ...]) -> ComplexArray:
+def _parts(table: StrictTable, shape: tuple[int, ...]) -> ComplexArray:
     log_gain, lag_rad = (_array(table, name, shape) for name in ("log_gain", "lag_rad"))
     return frozen(log_gain - 1j * lag_rad)
 
@@ -216,7 +218,7 @@ def _pair(y: ComplexArray) -> dict[str, Any]:
     return {"log_gain": y.real.tolist(), "lag_rad": (-y.imag).tolist()}
 
 
-def _array(table: Table, key: str, shape: tuple[int, ...]) -> FloatArray:
+def _array(table: StrictTable, key: str, shape: tuple[int, ...]) -> FloatArray:
     """Read nested arrays of finite numbers; NaN after a fault."""
     value = table.look(key)[1]
     flat: list[float] = []

@@ -39,7 +39,7 @@ _KEYS = {
 
 
 @dataclass(frozen=True)
-class Run:
+class TwinRun:
     """What a twin ran.
 
     Attributes:
@@ -80,7 +80,7 @@ class Run:
         return {key: json.dumps(value) for key, value in values.items()}
 
 
-def run_from_record(facts: Mapping[str, str]) -> Run:
+def run_from_record(facts: Mapping[str, str]) -> TwinRun:
     """Read the entries of the metadata record.
 
     Raises:
@@ -92,7 +92,7 @@ def run_from_record(facts: Mapping[str, str]) -> Run:
             for key, text in facts.items()
             if key.startswith(_SERVO)
         }
-        return Run(
+        return TwinRun(
             physics_rate_hz=float(facts["physics_rate_hz"]),
             start_heading_rad=float(facts["start_heading_rad"]),
             contact=bool(json.loads(facts["contact"])),
@@ -109,13 +109,13 @@ def run_from_record(facts: Mapping[str, str]) -> Run:
         raise ValueError(f"{type(error).__name__} {error}") from error
 
 
-def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> Run | None:
+def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> TwinRun | None:
     """Read the attached scenario of a session without the record; None if it is unreadable."""
     try:
         scenario = read_toml(text.decode())
         world, each = _table(scenario, "world"), _table(scenario, "servo_of")
         ground, links = _table(world, "ground"), _table(scenario, "link_of")
-        return Run(
+        return TwinRun(
             physics_rate_hz=float(scenario.get("physics_rate_hz", 1000)),
             start_heading_rad=float(world.get("heading", 0.0)),
             contact=world.get("surface", "flat") != "none" or bool(world.get("obstacles")),

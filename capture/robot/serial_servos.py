@@ -234,7 +234,7 @@ PROTOCOLS: Mapping[str, Protocol] = {
 }
 
 
-class Piece(NamedTuple):
+class StreamPiece(NamedTuple):
     """Bytes of the stream: a packet with a valid checksum, or bytes of none.
 
     Attributes:
@@ -259,7 +259,7 @@ class PacketSplitter:
         self._rest = b""
         self._done = 0
 
-    def feed(self, chunk: bytes, *, silence: bool = False) -> list[Piece]:
+    def feed(self, chunk: bytes, *, silence: bool = False) -> list[StreamPiece]:
         """Add bytes, and return what is complete now.
 
         Args:
@@ -267,7 +267,7 @@ class PacketSplitter:
         """
         data = self._rest + chunk
         header, judge = self._protocol.header, self._protocol.judge
-        pieces: list[Piece] = []
+        pieces: list[StreamPiece] = []
         start = at = 0  # of what is not handed out yet, of the search
         while (found := data.find(header, at)) >= 0:
             size = judge(data, found, silence)
@@ -277,13 +277,13 @@ class PacketSplitter:
                 at = found + 1
                 continue
             if found > start:
-                pieces.append(Piece(data[start:found], self._done + found, False))
+                pieces.append(StreamPiece(data[start:found], self._done + found, False))
             start = at = found + size
-            pieces.append(Piece(data[found:start], self._done + start, True))
+            pieces.append(StreamPiece(data[found:start], self._done + start, True))
         if found < 0:
             found = len(data) if silence else _header_begins(data, at, header)
         if found > start:
-            pieces.append(Piece(data[start:found], self._done + found, False))
+            pieces.append(StreamPiece(data[start:found], self._done + found, False))
         self._done += max(found, start)
         self._rest = data[max(found, start) :]
         return pieces

@@ -18,13 +18,13 @@ from typing import Protocol
 from ..common.process import join_running
 from ..log.messages.frames import FrameArray
 from .events import Tally
-from .link import Link
+from .link import BusConnection
 
 _JOIN_S = 1.0
 _MOST_HELD = 2_000_000  # frames: 64 MB, four minutes of a busy bus
 
 
-class LinkWithFile(Link, Protocol):
+class LinkWithFile(BusConnection, Protocol):
     """A link with a file descriptor to wait for."""
 
     def fileno(self) -> int:
@@ -33,7 +33,7 @@ class LinkWithFile(Link, Protocol):
 
 
 class DrainedLink:
-    """The :class:`.capture.sources.link.Link` that reads another one in a thread."""
+    """The :class:`.capture.sources.link.BusConnection` that reads another one in a thread."""
 
     def __init__(
         self, link: LinkWithFile, tally: Tally, *, pause_s: float, longest_s: float | None = None
@@ -60,7 +60,7 @@ class DrainedLink:
         self._thread.start()
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
-        """See :meth:`Link.read`."""
+        """See :meth:`BusConnection.read`."""
         error = self._error  # before the frames: none comes after it
         arrays: list[FrameArray] = []
         while self._held:

@@ -1,8 +1,8 @@
 """A source over one connection that may break and come back.
 
-A :class:`Link` is an open connection. A :class:`LinkedSource` opens one, reads it, and opens it
-again after a break, with growing pauses. Opening may block (a name to look up, an adapter that
-answers slowly), so each attempt has a thread of its own; reading never does.
+A :class:`BusConnection` is an open connection. A :class:`LinkedSource` opens one, reads it, and
+opens it again after a break, with growing pauses. Opening may block (a name to look up, an adapter
+that answers slowly), so each attempt has a thread of its own; reading never does.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Backoff:
         self._pause_ns = min(2 * self._pause_ns, _LONGEST_NS)
 
 
-class Link(Protocol):
+class BusConnection(Protocol):
     """An open connection; after the thread that opened it, one thread uses it."""
 
     @property
@@ -89,13 +89,13 @@ class Link(Protocol):
         """Release it, also a dead device; safe to call twice."""
 
 
-OpenLink = Callable[[Tally], Link]
+OpenLink = Callable[[Tally], BusConnection]
 """Opens a connection; may block. OSError: try again later. SourceError: it can never work."""
 
 
-def _open_in_thread(open_link: OpenLink, tally: Tally) -> Future[Link]:
+def _open_in_thread(open_link: OpenLink, tally: Tally) -> Future[BusConnection]:
     """Open a connection in a thread of its own; one that is cancelled is closed."""
-    opening: Future[Link] = Future()
+    opening: Future[BusConnection] = Future()
 
     def run() -> None:
         try:
@@ -145,8 +145,8 @@ class LinkedSource:
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._backoff = Backoff()
-        self._opening: Future[Link] | None = None
-        self._link: Link | None = None
+        self._opening: Future[BusConnection] | None = None
+        self._link: BusConnection | None = None
         self._was_up = False
         self._lost_ns: int | None = None
         self._lost = False
@@ -239,7 +239,7 @@ class LinkedSource:
         self._backoff.failed(now_ns)
         self._complain(complaint)
 
-    def _connected(self, link: Link, now_ns: int) -> None:
+    def _connected(self, link: BusConnection, now_ns: int) -> None:
         self._backoff.opened(now_ns)
         self._complaint = ""
         text = f"connected to {self._place}"

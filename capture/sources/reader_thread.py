@@ -90,7 +90,7 @@ _MMSGHDR = cast("np.dtype[np.void]", np.dtype(_Mmsghdr))
 
 
 @dataclass(frozen=True)
-class Batch:
+class PacketBatch:
     """Packets of one call. Lists, as they are mostly short: they cost less than numpy's columns.
 
     Attributes:
@@ -136,7 +136,7 @@ class ReceiveMany:
         drops = self._control[:, _STAMP.itemsize : _STAMP.itemsize + _DROPS.itemsize]
         self._drops = drops.view(_DROPS)[:, 0]
 
-    def receive(self, fileno: int) -> Batch:
+    def receive(self, fileno: int) -> PacketBatch:
         """Receive the packets of a socket, up to the capacity, without waiting.
 
         Raises:
@@ -180,10 +180,10 @@ class ReceiveMany:
         sizes: list[int] = self._sizes[:count].tolist()
         return sizes
 
-    def batch(self, start: int, stop: int) -> Batch:
+    def batch(self, start: int, stop: int) -> PacketBatch:
         """Return received packets."""
         if start == stop:
-            return Batch(self._packets[:0], [], [], [], None)
+            return PacketBatch(self._packets[:0], [], [], [], None)
         heads = self._heads[start:stop]
         used: list[int] = heads["controllen"].tolist()
         heads["controllen"] = _CONTROL  # for the next call
@@ -198,7 +198,7 @@ class ReceiveMany:
                 n for (_, kind, n), room in rows if kind == _DROPS_KIND and room > _STAMP.itemsize
             ]
             drops = counts[-1] if counts else None
-        return Batch(
+        return PacketBatch(
             packets=self._packets[start:stop],
             sizes=heads["size"].tolist(),
             flags=heads["flags"].tolist(),
@@ -331,7 +331,7 @@ class ReceiveThread:
         fcntl.ioctl(self._sock.fileno(), termios.FIONREAD, size)
         return size[0] > 0
 
-    def take(self, most: int) -> list[Batch]:
+    def take(self, most: int) -> list[PacketBatch]:
         """Return the received packets, at least ``most`` if there are so many.
 
         They are valid until the next call.
@@ -341,7 +341,7 @@ class ReceiveThread:
             rows.count = None
             self._free.append(rows)
         self._used.clear()
-        batches: list[Batch] = []
+        batches: list[PacketBatch] = []
         while self._filled and most > 0:
             rows = self._filled[0]
             count = rows.count

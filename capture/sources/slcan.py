@@ -81,7 +81,7 @@ class SlcanText:
         Args:
             stamps: Whether to take the device times from the adapter's stamps.
         """
-        self._stamps = StampClock() if stamps else None
+        self._stamps = AdapterClock() if stamps else None
         self._rest = b""
         self._has_fd = False
 
@@ -138,7 +138,7 @@ class SlcanText:
         return pack_record(device_ns, t_ns, flags, length, 0, data)
 
 
-class StampClock:
+class AdapterClock:
     """Adds the minutes to an adapter's stamps, which start again after each."""
 
     def __init__(self) -> None:

@@ -27,7 +27,7 @@ from .reader_thread import (
     SO_RXQ_OVFL,
     SO_TIMESTAMPNS,
     ArrivalClock,
-    Batch,
+    PacketBatch,
     ReceiveMany,
     enlarge_buffer,
 )
@@ -49,7 +49,7 @@ _MOST_DRAINED = 4096  # after an error: more than the largest buffer holds
 _PAUSE_S = 0.005  # the kernel has the times
 
 
-def frames_of(batch: Batch, times_ns: Sequence[int], *, fd: bool = False) -> FrameArray:
+def frames_of(batch: PacketBatch, times_ns: Sequence[int], *, fd: bool = False) -> FrameArray:
     """Convert the kernel's frames of one kind, classic or CAN FD.
 
     Args:
@@ -126,7 +126,7 @@ class SocketcanLink:
         """Close the socket."""
         self._socket.close()
 
-    def _count(self, batch: Batch) -> None:
+    def _count(self, batch: PacketBatch) -> None:
         whole = batch.sizes.count(CAN_MTU) + batch.sizes.count(CANFD_MTU)
         self._tally.malformed("packet that is no CAN frame", len(batch.sizes) - whole)
         if batch.drops is not None and batch.drops != self._drops:

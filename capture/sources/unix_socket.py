@@ -47,7 +47,7 @@ from .contract import (
     only,
 )
 from .events import BusWatch, Tally
-from .reader_thread import SO_SNDBUFFORCE, ArrivalClock, Batch, ReceiveThread, enlarge_buffer
+from .reader_thread import SO_SNDBUFFORCE, ArrivalClock, PacketBatch, ReceiveThread, enlarge_buffer
 
 _MOST_PACKETS = 8192  # in one poll, of one sender
 _BACKLOG = 64
@@ -277,7 +277,7 @@ class UnixSource:
         if ended:
             self._remove(sender)
 
-    def _unpack(self, sender: _Sender, batch: Batch, times: list[int]) -> FrameArray:
+    def _unpack(self, sender: _Sender, batch: PacketBatch, times: list[int]) -> FrameArray:
         flat = batch.packets.reshape(-1).data
         width = batch.packets.shape[1]
         pieces: list[memoryview] = []

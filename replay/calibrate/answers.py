@@ -21,11 +21,11 @@ from scipy.interpolate import CubicHermiteSpline
 from undulog.capture.common.arrays import FloatArray
 from undulog.sim.gait.contract import CONTROL_RATE_HZ
 from undulog.sim.scenario.scenario import Kernels, Scenario
-from undulog.sim.scenario.sensors import Noise, SensorModels
+from undulog.sim.scenario.sensors import SensorModels, SensorNoise
 from undulog.sim.twin.twin import Plant, check_state
 
 from .parameters import Unknown, late_s, with_values
-from .recorded import Measured, Recorded, joined
+from .recorded import MeasuredAngles, Recorded, joined
 
 _BATCH_BYTES = 500e6
 """Memory of a block of a batch, at most."""
@@ -41,7 +41,7 @@ _KNOTS = 5
 the middle leaves 0.5 mrad; the error falls with the square of their distance."""
 
 
-class Track(NamedTuple):
+class RunTrack(NamedTuple):
     """Joint angles and rates of a run over time.
 
     Attributes:
@@ -102,7 +102,7 @@ class Answers:
         return self.sessions[0].scenario
 
     @cached_property
-    def measured(self) -> Measured:
+    def measured(self) -> MeasuredAngles:
         """Joint angles of all sessions."""
         return joined(self.sessions)
 
@@ -167,21 +167,23 @@ class Answers:
         for of_point in zip(*parts, strict=True):
             yield tuple(chain.from_iterable(of_point))
 
-    def _run_batch(self, session: Recorded, scenarios: Sequence[Scenario]) -> Iterator[Track]:
+    def _run_batch(self, session: Recorded, scenarios: Sequence[Scenario]) -> Iterator[RunTrack]:
         from undulog.sim import run_batch  # needs numba
 
         self.on_tick()
         begun = time.perf_counter()
         # Commands were read as they were given: they are rounded already.
-        plain = [dataclasses.replace(s, noise=Noise(), sensing=SensorModels()) for s in scenarios]
+        plain = [
+            dataclasses.replace(s, noise=SensorNoise(), sensing=SensorModels()) for s in scenarios
+        ]
         runs = run_batch(plain, commands=[session.references] * len(plain))
         self.work.book(len(runs), session.scenario, begun)
         for run in runs:
             if run.error is not None:
                 raise run.error
-            yield Track(run.time_s, run.angle, run.rate)
+            yield RunTrack(run.time_s, run.angle, run.rate)
 
-    def _run(self, session: Recorded, scenario: Scenario) -> Track:
+    def _run(self, session: Recorded, scenario: Scenario) -> RunTrack:
         """Run the twin without noise.
 
         Raises:
@@ -202,7 +204,7 @@ class Answers:
                 motion[tick * knots : (tick + 1) * knots + 1] = rows.motion[::stride]
         self.work.book(1, scenario, begun)
         times_s = np.arange(len(motion)) / (CONTROL_RATE_HZ * knots)
-        return Track(times_s, motion[:, 0], motion[:, 1])
+        return RunTrack(times_s, motion[:, 0], motion[:, 1])
 
 
 def _fits_batch(session: Recorded) -> bool:
@@ -213,7 +215,7 @@ def _fits_batch(session: Recorded) -> bool:
     return not (scenario.world.obstacles or scenario.disturbances) and size <= _BATCH_BYTES
 
 
-def sampled(track: Track, session: Recorded, late_s: float = 0.0) -> tuple[FloatArray, ...]:
+def sampled(track: RunTrack, session: Recorded, late_s: float = 0.0) -> tuple[FloatArray, ...]:
     """A run at the measured instants of its session.
 
     Args:

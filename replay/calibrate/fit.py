@@ -22,7 +22,7 @@ from .identifiability import (
     ridges,
     suggested_recordings,
 )
-from .lack_of_fit import LackOfFit, Misfit, halves, lack_of_fit, misfit
+from .lack_of_fit import JointMisfit, LackOfFit, halves, lack_of_fit, misfit
 from .least_squares import LinearFit
 from .parameters import DELAY, Unknown, module_unknown, unknowns, with_values
 from .recorded import check_alike, read_recorded
@@ -54,7 +54,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedParameter:
     """One parameter; values in its unit, of a module its factor on the shared one.
 
     Attributes:
@@ -76,7 +76,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationResult:
     """What came of a fit.
 
     Attributes:
@@ -96,11 +96,11 @@ class Calibration:
     sessions: tuple[str, ...]
     world: str
     scenario: Scenario
-    parameters: tuple[Fitted, ...]
+    parameters: tuple[FittedParameter, ...]
     ridges: tuple[CorrelatedParameters, ...]
     would_tell: tuple[str, ...]
-    before: dict[str, Misfit]
-    after: dict[str, Misfit]
+    before: dict[str, JointMisfit]
+    after: dict[str, JointMisfit]
     search: Search | None
     lack: LackOfFit
     step: StepSize
@@ -120,7 +120,7 @@ def calibrate(
     kernels: Kernels = Kernels.NUMPY,
     on_tick: Callable[[], None] = lambda: None,
     on_iteration: Callable[[int, float, float], None] = lambda _k, _rms, _speed: None,
-) -> Calibration:
+) -> CalibrationResult:
     """Fit the twin to one or several sessions, which share all parameters.
 
     Args:
@@ -183,7 +183,7 @@ def _calibration(
     *,
     search: Search | None,
     within: float,
-) -> Calibration:
+) -> CalibrationResult:
     step = step_size(answers, solution)
     lack = _lack(answers, solution, step.freed(solution))
     ends = _ends(solution, lack.alternatives)
@@ -192,7 +192,7 @@ def _calibration(
     )
     unclear = [i for i, p in enumerate(parameters) if not (p.determined or lack.found)]
     by_step = [i for i in unclear if of_this_step[i].determined]
-    return Calibration(
+    return CalibrationResult(
         sessions=tuple(str(session.path) for session in answers.sessions),
         world=answers.scenario.name,
         scenario=with_values(answers.scenario, solution.unknowns, solution.x),
@@ -227,7 +227,7 @@ def _ends(solution: Solution, others: Sequence[Alternative]) -> tuple[FloatArray
 
 def _all_fitted(
     solution: Solution, ends: tuple[FloatArray, FloatArray], within: float, *, fits: bool
-) -> tuple[Fitted, ...]:
+) -> tuple[FittedParameter, ...]:
     rows = np.column_stack([solution.x, *ends]).tolist()
     return tuple(
         _fitted(unknown, x, (low, high), within, fits=fits)
@@ -237,11 +237,11 @@ def _all_fitted(
 
 def _fitted(
     one: Unknown, x: float, ends: tuple[float, float], within: float, *, fits: bool
-) -> Fitted:
+) -> FittedParameter:
     half = max(x - ends[0], ends[1] - x)
     # A dead time is no share of itself: 5 % of a control period stand for 5 %.
     wide = one.value(half) * 100.0 if one.name == DELAY else float(np.expm1(half))
-    return Fitted(
+    return FittedParameter(
         name=one.name,
         label=one.label,
         unit=one.unit,
@@ -253,7 +253,7 @@ def _fitted(
     )
 
 
-def _misfits(answers: Answers, residuals: Sequence[np.ndarray]) -> dict[str, Misfit]:
+def _misfits(answers: Answers, residuals: Sequence[np.ndarray]) -> dict[str, JointMisfit]:
     measured = answers.measured
     rows = zip(measured.joints, measured.times_s, measured.angles, residuals, strict=True)
     return {joint: misfit(t, angle, angle - rest) for joint, t, angle, rest in rows}

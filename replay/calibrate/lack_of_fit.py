@@ -39,7 +39,7 @@ from undulog.capture.common.arrays import FloatArray
 
 from .identifiability import Alternative
 from .least_squares import LeastSquares, larger
-from .recorded import Measured
+from .recorded import MeasuredAngles
 
 _STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
@@ -60,7 +60,7 @@ LEVEL = 0.05
 
 
 @dataclass(frozen=True)
-class Misfit:
+class JointMisfit:
     """One joint.
 
     Attributes:
@@ -74,7 +74,7 @@ class Misfit:
     late_s: float | None = None
 
 
-def misfit(times_s: FloatArray, measured: FloatArray, twin: FloatArray) -> Misfit:
+def misfit(times_s: FloatArray, measured: FloatArray, twin: FloatArray) -> JointMisfit:
     """Hold one joint against the twin's.
 
     Args:
@@ -83,10 +83,10 @@ def misfit(times_s: FloatArray, measured: FloatArray, twin: FloatArray) -> Misfi
     """
     rms = float(np.sqrt(np.mean((measured - twin) ** 2)))
     if np.sqrt(np.mean(twin**2)) < _STILL or np.unique(times_s).size < times_s.size:
-        return Misfit(rms)
+        return JointMisfit(rms)
     rate = np.gradient(twin, times_s)
     along, late = np.linalg.lstsq(np.stack([twin, rate - rate.mean()], axis=1), measured)[0]
-    return Misfit(rms, float(along - 1.0), float(-late / along))
+    return JointMisfit(rms, float(along - 1.0), float(-late / along))
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class LackOfFit:
 
 
 def lack_of_fit(
-    measured: Measured,
+    measured: MeasuredAngles,
     residuals: Sequence[FloatArray],
     omegas: Sequence[float | None],
     unfitted: Unfitted | None,

@@ -25,7 +25,7 @@ FEWEST = 20
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredAngles:
     """Joint angles of the settled part.
 
     Attributes:
@@ -53,7 +53,7 @@ class Recorded:
     path: Path
     scenario: Scenario
     commands: CommandReplay
-    measured: Measured
+    measured: MeasuredAngles
     omega: float | None
 
     @property
@@ -104,7 +104,7 @@ def read_recorded(
     return Recorded(path, scenario, commands, measured, omega)
 
 
-def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measured:
+def read_measured(session: SessionView, settle_s: float, end_s: float) -> MeasuredAngles:
     """Read what the joints did.
 
     Args:
@@ -134,7 +134,7 @@ def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measur
             f"{settle_s:g} s and {end_s:g} s; is --settle too long?"
         )
     times, values = zip(*settled.values(), strict=True)
-    return Measured(tuple(settled), times, values)
+    return MeasuredAngles(tuple(settled), times, values)
 
 
 def check_alike(sessions: Sequence[Recorded]) -> None:
@@ -159,7 +159,7 @@ def check_alike(sessions: Sequence[Recorded]) -> None:
                 )
 
 
-def joined(sessions: Sequence[Recorded]) -> Measured:
+def joined(sessions: Sequence[Recorded]) -> MeasuredAngles:
     """The joints of all sessions, one after the other; of several, named with their session."""
     if len(sessions) == 1:
         return sessions[0].measured
@@ -167,7 +167,7 @@ def joined(sessions: Sequence[Recorded]) -> Measured:
     if len(set(names)) < len(names):
         names = [str(session.path) for session in sessions]
     parts = [session.measured for session in sessions]
-    return Measured(
+    return MeasuredAngles(
         tuple(
             f"{j} of {name}" for part, name in zip(parts, names, strict=True) for j in part.joints
         ),

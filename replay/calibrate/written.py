@@ -20,10 +20,10 @@ from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.scenario import Modules
 
-from .fit import Calibration
+from .fit import CalibrationResult
 
 
-def _robot_text(calibration: Calibration) -> str:
+def _robot_text(calibration: CalibrationResult) -> str:
     """The robot description with the fitted servo.
 
     Returns:
@@ -67,7 +67,7 @@ def _robot_text(calibration: Calibration) -> str:
     return text
 
 
-def _scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Path) -> str:
+def _scenario_text(calibration: CalibrationResult, robot_file: Path, scenario_file: Path) -> str:
     """The scenario in which the session can be run again.
 
     Args:
@@ -86,7 +86,7 @@ def _scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pa
 
 
 def write_calibration(
-    calibration: Calibration, robot_file: Path, scenario_file: Path | None
+    calibration: CalibrationResult, robot_file: Path, scenario_file: Path | None
 ) -> None:
     """Write the robot, and what its description lists, and the scenario if it is wanted.
 

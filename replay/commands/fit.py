@@ -16,9 +16,9 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..calibrate.fit import Calibration, Fitted
+    from ..calibrate.fit import CalibrationResult, FittedParameter
     from ..calibrate.identifiability import Alternative
-    from ..calibrate.lack_of_fit import LackOfFit, Misfit
+    from ..calibrate.lack_of_fit import JointMisfit, LackOfFit
 
 _NOT_NOISE = 3.0
 """An autocorrelation time of the residual from which it is called out [samples]."""
@@ -128,7 +128,7 @@ def _check(output: Path, scenario: Path | None, spread: float, within: float, *,
         raise UsageError("--module and --modules: give one of them")
 
 
-def _summary(calibration: Calibration) -> Iterator[str]:
+def _summary(calibration: CalibrationResult) -> Iterator[str]:
     """Yield lines for a terminal: the answer first, joints last."""
     before, after = (_rms(one) for one in (calibration.before, calibration.after))
     if calibration.lack.found:
@@ -159,7 +159,7 @@ def _summary(calibration: Calibration) -> Iterator[str]:
         yield f"  {joint}  {_misfit(first, calibration.after[joint])}"
 
 
-def _facts(calibration: Calibration) -> dict[str, Any]:
+def _facts(calibration: CalibrationResult) -> dict[str, Any]:
     """Return the calibration as plain JSON values, in SI units."""
     search, lack = calibration.search, calibration.lack
     return {
@@ -274,13 +274,13 @@ def _p(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 
-def _rms(misfits: dict[str, Misfit]) -> float:
+def _rms(misfits: dict[str, JointMisfit]) -> float:
     import numpy as np
 
     return float(np.sqrt(np.mean([misfit.rms**2 for misfit in misfits.values()])))
 
 
-def _parameter(fitted: Fitted, width: int) -> str:
+def _parameter(fitted: FittedParameter, width: int) -> str:
     from ..calibrate.parameters import DELAY
 
     scale, unit = (
@@ -295,7 +295,7 @@ def _parameter(fitted: Fitted, width: int) -> str:
     return f"{fitted.label:{width}}  {numbers} {unit}".rstrip() + before + open_
 
 
-def _undetermined(calibration: Calibration) -> Iterator[str]:
+def _undetermined(calibration: CalibrationResult) -> Iterator[str]:
     from ..calibrate.parameters import DELAY
 
     open_ones = [
@@ -313,7 +313,7 @@ def _undetermined(calibration: Calibration) -> Iterator[str]:
     yield from (f"  what would determine {line}" for line in calibration.would_tell)
 
 
-def _search(calibration: Calibration) -> Iterator[str]:
+def _search(calibration: CalibrationResult) -> Iterator[str]:
     if (search := calibration.search) is None:
         return
     p = _p(search.p)
@@ -331,7 +331,7 @@ def _search(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _misfit(first: Misfit, last: Misfit) -> str:
+def _misfit(first: JointMisfit, last: JointMisfit) -> str:
     text = f"{first.rms:.4f} -> {last.rms:.4f} rad"
     if first.gain is None or last.gain is None or first.late_s is None or last.late_s is None:
         return text

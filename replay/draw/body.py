@@ -27,9 +27,9 @@ from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.kinematics import mesh_type, quaternion_from_rotation
 from undulog.capture.robot.model import Robot
 
-from ..samples.content import GREY, NAMED, Color, Content, Places
+from ..samples.content import GREY, NAMED, BodyPlaces, Color, Content
 from ..samples.quantities import power_limit, segment_power
-from ..samples.timeline import Clock
+from ..samples.timeline import TimeColumns
 from .motion import Motion
 
 MESHES = "/world/snake/meshes"
@@ -73,7 +73,7 @@ class Look:
     """
 
     robot: Robot | None
-    places: Places | None
+    places: BodyPlaces | None
     palette: Mapping[str, Color]
     limit_w: float | None
     named: Sequence[str] = ()
@@ -231,7 +231,7 @@ def capsule_columns(
 
 
 def log_body(
-    rec: rr.RecordingStream, clock: Clock, motion: Motion, *, limit_w: float | None = None
+    rec: rr.RecordingStream, clock: TimeColumns, motion: Motion, *, limit_w: float | None = None
 ) -> float | None:
     """Draw the measured body, coloured by power per segment.
 
@@ -260,7 +260,9 @@ def log_body(
     return limit
 
 
-def log_ghost(rec: rr.RecordingStream, clock: Clock, motion: Motion, chosen: IntArray) -> None:
+def log_ghost(
+    rec: rr.RecordingStream, clock: TimeColumns, motion: Motion, chosen: IntArray
+) -> None:
     """Draw the commanded shape on the measured head, as a grey wireframe.
 
     Args:
@@ -326,9 +328,9 @@ def above_joints(
 
 def log_markers(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     motion: Motion,
-    places: Places | None,
+    places: BodyPlaces | None,
     palette: Mapping[str, Color],
     *,
     named: IntArray,
@@ -376,7 +378,7 @@ def _known_points(
 
 def log_marks(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     motion: Motion,
     names: Sequence[str],
     chosen: IntArray,

@@ -1,7 +1,7 @@
 """What is drawn of a session, piece by piece: the same for a file and for a viewer that runs.
 
 The caller decides the order: a file is written when everything is known, a viewer gets the
-beginning first. :attr:`Drawing.content` is the content drawn so far.
+beginning first. :attr:`RerunDrawing.content` is the content drawn so far.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.capture.robot.model import Robot
 
 from ..samples import content as entities
-from ..samples.content import Content, Layer, Named, Start
+from ..samples.content import Content, InitialPose, Layer, Named
 from ..samples.quantities import GAIT, Survey, quantities, survey
-from ..samples.timeline import ENSEMBLE_CYCLE, Clock, Span, Stretch
+from ..samples.timeline import ENSEMBLE_CYCLE, DrawnSpan, SpanSamples, TimeColumns
 from ..samples.tracks import Track, drawn_topics, read_columns
 from . import lines
 from .body import Look, body_title
@@ -45,7 +45,7 @@ FACTS = "/session"
 
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
 
-_WHOLE = Span()
+_WHOLE = DrawnSpan()
 
 
 def escaped(text: str) -> str:
@@ -218,7 +218,7 @@ class Sources:
         return self.found.samples.get(entities.COMMANDED, ())
 
 
-def clock_of(session: SessionView) -> Clock:
+def clock_of(session: SessionView) -> TimeColumns:
     """Return the session's timelines.
 
     Returns:
@@ -227,20 +227,20 @@ def clock_of(session: SessionView) -> Clock:
     phases: tuple[Track, ...] = ()
     if GAIT in session.channels:
         phases = read_columns(session, {GAIT: ["position"]}).get((GAIT, "position"), ())
-    return Clock(session.start_ns, lines.rhythm_of(phases))
+    return TimeColumns(session.start_ns, lines.rhythm_of(phases))
 
 
-class Drawing:
+class RerunDrawing:
     """A session on its way into a recording stream."""
 
     def __init__(
         self,
         rec: rr.RecordingStream,
-        clock: Clock,
+        clock: TimeColumns,
         sources: Sources,
         named: Sequence[Named] = (),
         *,
-        span: Span = _WHOLE,
+        span: DrawnSpan = _WHOLE,
         averaged: Averaged | None = None,
     ) -> None:
         """Write styles and static entities.
@@ -272,7 +272,7 @@ class Drawing:
         """Power at which a segment's colour is full [W]; None where no body is drawn."""
         return None if self._head is None else self._sources.found.power_limit_w
 
-    def write(self, stretch: Stretch) -> None:
+    def write(self, stretch: SpanSamples) -> None:
         """Draw a stretch."""
         span = stretch.span
         if self._averaged is not None:
@@ -283,7 +283,7 @@ class Drawing:
         if self._scene is not None:
             self._scene.write(stretch)
 
-    def widen(self, found: Survey, span: Span) -> None:
+    def widen(self, found: Survey, span: DrawnSpan) -> None:
         """Continue with a further part of a session whose beginning is drawn.
 
         Args:
@@ -390,7 +390,7 @@ class Drawing:
         robot = self._sources.session.robot
         return Look(robot, self._places, self._palette, limit_w, self._named)
 
-    def _open_scene(self, span: Span) -> tuple[HeadPath | None, Scene | None]:
+    def _open_scene(self, span: DrawnSpan) -> tuple[HeadPath | None, Scene | None]:
         """The 3D scene, where there is a robot whose joints were measured."""
         sources = self._sources
         robot, measured = sources.session.robot, sources.measured
@@ -432,7 +432,7 @@ def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.
     return dict.fromkeys(names, entities.GREY) | lines.joint_palette(robot.joint_names)
 
 
-def start_of(head: HeadPath) -> Start | None:
+def start_of(head: HeadPath) -> InitialPose | None:
     """Return the initial pose of the robot, for the camera.
 
     Args:
@@ -447,4 +447,4 @@ def start_of(head: HeadPath) -> Start | None:
     x, y, z = head.position[known[0]].tolist()
     forward = rotation_from_quaternion(head.quaternion[known[0]])[:, 0]
     heading = float(np.arctan2(forward[1], forward[0]))
-    return Start((x, y, z), heading if np.isfinite(heading) else 0.0)
+    return InitialPose((x, y, z), heading if np.isfinite(heading) else 0.0)

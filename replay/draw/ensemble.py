@@ -24,8 +24,8 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses
 from undulog.capture.robot.model import Robot
 
-from ..samples.content import Places
-from ..samples.timeline import Rhythm
+from ..samples.content import BodyPlaces
+from ..samples.timeline import LoggedRhythm
 from ..samples.tracks import Track, interpolate
 
 DEGREES = np.rint(np.degrees(np.append(phases_rad(), 2 * np.pi))).astype(np.int64)
@@ -35,7 +35,7 @@ _NS = 1e9
 
 
 @dataclass(frozen=True)
-class Pace:
+class CyclePhase:
     """The gait's phase over the time window whose cycles are averaged.
 
     Attributes:
@@ -61,7 +61,7 @@ class Pace:
         turns = (self.ends_rad[1] - self.ends_rad[0]) / (2 * np.pi)
         return (self.stop_s - self.start_s) / turns
 
-    def shortened(self, stop_s: float, start_ns: int) -> Pace:
+    def shortened(self, stop_s: float, start_ns: int) -> CyclePhase:
         """Return the pace up to an earlier end.
 
         Args:
@@ -126,13 +126,13 @@ class MeanCycles:
 
 
 def pace_of(
-    rhythm: Rhythm | None,
+    rhythm: LoggedRhythm | None,
     analysis: Analysis | None,
     *,
     commanded: Sequence[Track],
-    places: Places | None,
+    places: BodyPlaces | None,
     start_ns: int,
-) -> Pace | None:
+) -> CyclePhase | None:
     """Return the time window that is averaged, and its phase.
 
     Args:
@@ -165,7 +165,7 @@ def pace_of(
     ends = _at(t_s[i:j], phase, float(first)), _at(t_s[i:j], phase, float(last))
     if not np.all(np.diff(phase) > 0) or ends[1] - ends[0] < 2 * np.pi - 1e-6:
         return None
-    return Pace(rhythm.t_ns[i:j], phase, float(first), float(last), ends, logged=True)
+    return CyclePhase(rhythm.t_ns[i:j], phase, float(first), float(last), ends, logged=True)
 
 
 def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple[str, ...]:
@@ -184,7 +184,7 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
     return tuple(dict.fromkeys(one.joint for one in false if one.within(start_s, stop_s)))
 
 
-def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
+def mean_cycles(tracks: Sequence[Track], pace: CyclePhase) -> MeanCycles | None:
     """Return the mean cycles of channels.
 
     Args:
@@ -244,9 +244,9 @@ def _fitted(
     frequency_hz: float,
     window: tuple[float, float],
     commanded: Sequence[Track],
-    places: Places,
+    places: BodyPlaces,
     start_ns: int,
-) -> Pace | None:
+) -> CyclePhase | None:
     """Return the phase of a fitted rhythm: 0 at the crest of the first joint's command."""
     track = next((one for one in commanded if one.name == places.names[0]), None)
     cycles = (window[1] - window[0]) * frequency_hz
@@ -261,10 +261,10 @@ def _fitted(
     at_s = np.linspace(*window, 2 + int(cycles * PHASES))
     ends = omega * window[0] + crest, omega * window[1] + crest
     at_ns = start_ns + np.round(at_s * _NS).astype(np.int64)
-    return Pace(at_ns, omega * at_s + crest, *window, ends, logged=False)
+    return CyclePhase(at_ns, omega * at_s + crest, *window, ends, logged=False)
 
 
-def _cut(track: Track, pace: Pace) -> FloatArray:
+def _cut(track: Track, pace: CyclePhase) -> FloatArray:
     """Return a channel's whole cycles, shape (c, ``PHASES``)."""
     phase = interpolate(pace.t_ns, pace.phase_rad, track.t_ns)
     known: BoolArray = np.isfinite(phase) & np.isfinite(track.values)

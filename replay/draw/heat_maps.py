@@ -21,12 +21,12 @@ from undulog.analysis.results.formats import number
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors, scale_ends
 
-from ..samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
-from ..samples.timeline import Clock
+from ..samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleQuantity, CycleTable, HeatMap
+from ..samples.timeline import TimeColumns
 from .body import power_colors
 from .steps import cycle_edges_ns, together
 
-POWER = Quantity("power_milliwatt", "Power", "mW")
+POWER = CycleQuantity("power_milliwatt", "Power", "mW")
 
 SIZE = (360.0, 300.0)
 """Width and height of the cells together [scene units]."""
@@ -100,7 +100,10 @@ def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:
 
 
 def log_maps(
-    rec: rr.RecordingStream, clock: Clock, maps: Sequence[HeatMap], named: Collection[str] = ()
+    rec: rr.RecordingStream,
+    clock: TimeColumns,
+    maps: Sequence[HeatMap],
+    named: Collection[str] = (),
 ) -> None:
     """Write the maps.
 
@@ -219,7 +222,7 @@ def _cell_texts(shown: HeatMap) -> Iterator[str]:
             yield f"{name}, {start:.2f} to {stop:.2f} s: {value} {unit}"
 
 
-def _log_frame(rec: rr.RecordingStream, clock: Clock, shown: HeatMap) -> None:
+def _log_frame(rec: rr.RecordingStream, clock: TimeColumns, shown: HeatMap) -> None:
     """Draw a frame about the cycle at the cursor; none where there is no cycle."""
     count, _, height = _cells(shown)
     t_ns, ends = cycle_edges_ns(shown.table, clock.start_ns)

@@ -22,8 +22,8 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ..samples.content import GREY, SCALARS, TOTAL, Color, Places, line_title
-from ..samples.timeline import Clock, Rhythm
+from ..samples.content import GREY, SCALARS, TOTAL, BodyPlaces, Color, line_title
+from ..samples.timeline import LoggedRhythm, TimeColumns
 from ..samples.tracks import Track, rounded
 
 PLACES = "/joints/places"
@@ -66,7 +66,7 @@ def joint_palette(names: Sequence[str]) -> dict[str, Color]:
     return {name: (r, g, b, a) for name, (r, g, b, a) in zip(names, colors, strict=True)}
 
 
-def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | None:
+def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> BodyPlaces | None:
     """Choose the joints that stand for the whole body.
 
     Args:
@@ -85,10 +85,10 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
         planes = {one: [j.name for j in robot.joints if j.plane is one] for one in Plane}
         plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
         names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
-    return Places(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
+    return BodyPlaces(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
 
 
-def places_look(places: Places, kind: str) -> dict[str, Any]:
+def places_look(places: BodyPlaces, kind: str) -> dict[str, Any]:
     """Return names and width of the lines of head, middle and tail, for :func:`log_look`.
 
     Args:
@@ -145,7 +145,7 @@ def log_look(
 
 def log_rows(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     entity: str,
     t_ns: IntArray,
     values: FloatArray,
@@ -183,7 +183,7 @@ def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     rec.log(f"{TOTAL}/{kind}", look, static=True)
 
 
-def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
+def rhythm_of(gait: Sequence[Track]) -> LoggedRhythm | None:
     """Return the phase of the plane that swings most.
 
     Args:
@@ -193,10 +193,10 @@ def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
         The rhythm, or None where there is no phase or none advances by a whole cycle.
     """
     by_name = {track.name: track for track in gait}
-    found: list[tuple[float, Rhythm]] = []
+    found: list[tuple[float, LoggedRhythm]] = []
     for name, track in by_name.items():
         if name.endswith(".phase"):
-            rhythm = Rhythm.from_phase(track.t_ns, track.values)
+            rhythm = LoggedRhythm.from_phase(track.t_ns, track.values)
             if np.ptp(rhythm.cycles) >= 1.0:
                 amplitude = by_name.get(f"{name.removesuffix('.phase')}.A")
                 swing = float(np.nanmax(np.abs(amplitude.values))) if amplitude else 0.0
@@ -214,7 +214,7 @@ def changes(states: Sequence[str]) -> list[int]:
 
 
 def log_mode(
-    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
+    rec: rr.RecordingStream, clock: TimeColumns, session: SessionView, warnings: list[str]
 ) -> int:
     """Write the gait mode as a state that lasts until the next one.
 
@@ -230,7 +230,9 @@ def log_mode(
     return len(turns)
 
 
-def log_states(rec: rr.RecordingStream, clock: Clock, states: Sequence[tuple[int, str]]) -> None:
+def log_states(
+    rec: rr.RecordingStream, clock: TimeColumns, states: Sequence[tuple[int, str]]
+) -> None:
     """Write states, each lasting until the next one.
 
     Args:
@@ -243,7 +245,7 @@ def log_states(rec: rr.RecordingStream, clock: Clock, states: Sequence[tuple[int
 
 
 def log_events(
-    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
+    rec: rr.RecordingStream, clock: TimeColumns, session: SessionView, warnings: list[str]
 ) -> bool:
     """Write events and faults from ``/rosout``.
 
@@ -255,7 +257,9 @@ def log_events(
     return bool(events)
 
 
-def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int, Any]]) -> None:
+def log_lines(
+    rec: rr.RecordingStream, clock: TimeColumns, events: Sequence[tuple[int, Any]]
+) -> None:
     """Write events as lines of text.
 
     Args:
@@ -267,7 +271,7 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
 
 def log_texts(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     entity: str,
     lines: Sequence[tuple[int, str]],
     levels: Sequence[rr.TextLogLevel],

@@ -20,12 +20,12 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
 
-from ..samples.content import GREY, Color, MeanCycle, Series, line_title
+from ..samples.content import GREY, Color, MeanCycle, PlottedSeries, line_title
 from ..samples.quantities import mechanical_power, segment_power
-from ..samples.timeline import ENSEMBLE_CYCLE, Clock, Span, Stretch
+from ..samples.timeline import ENSEMBLE_CYCLE, DrawnSpan, SpanSamples, TimeColumns
 from ..samples.tracks import Columns, Track, read_columns
 from .body import Look, capsule_columns, capsule_poses, power_colors
-from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
+from .ensemble import DEGREES, CyclePhase, MeanCycles, body_frame, falsified, mean_cycles, pace_of
 from .lines import log_look
 
 ENSEMBLE = "/ensemble"
@@ -48,7 +48,7 @@ class Averaged:
     They are kept from the stretches that are drawn, or else read.
     """
 
-    def __init__(self, clock: Clock, analysis: Analysis | None) -> None:
+    def __init__(self, clock: TimeColumns, analysis: Analysis | None) -> None:
         """Keep nothing by now.
 
         Args:
@@ -57,10 +57,10 @@ class Averaged:
         windows = () if analysis is None else analysis.gait.windows
         late_ns = round(windows[0].start_s * 1e9) if windows else 0
         start_ns = clock.start_ns + late_ns
-        self._window = Span(start_ns, start_ns + round(MOST_S * 1e9))
+        self._window = DrawnSpan(start_ns, start_ns + round(MOST_S * 1e9))
         self._kept: dict[tuple[str, str], dict[str, list[Track]]] = {}
 
-    def keep(self, stretch: Stretch) -> None:
+    def keep(self, stretch: SpanSamples) -> None:
         """Keep copies of what is averaged of the samples in a stretch's span."""
         for key, tracks in stretch.columns.items():
             for track in tracks if key[0] in _TOPICS else ():
@@ -100,7 +100,7 @@ class Averaged:
 
 def log_mean_cycle(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     columns: Columns,
     look: Look,
     *,
@@ -138,13 +138,13 @@ def log_mean_cycle(
     steady = analysis is None or analysis.gait.frequency_hz.value is not None
     about = _about(pace, moved, steady=steady)
     rec.log(ABOUT, rr.TextDocument(about, media_type="text/markdown"), static=True)
-    error: tuple[Series, ...] = ()
+    error: tuple[PlottedSeries, ...] = ()
     if asked is not None:
         both = tuple(name for name in moved.names if name in asked.names)
         difference = np.degrees(moved.ordered(both) - asked.ordered(both))
         error = _log_joints(rec, f"{ENSEMBLE}/error", both, difference, look.palette)
     angles = np.degrees(moved.value.T)
-    spent: tuple[Series, ...] = ()
+    spent: tuple[PlottedSeries, ...] = ()
     if power is not None:
         spent = _log_joints(rec, f"{ENSEMBLE}/power", power.names, power.value.T, look.palette)
     return MeanCycle(
@@ -161,7 +161,7 @@ def _times() -> list[rr.TimeColumn]:
     return [rr.TimeColumn(ENSEMBLE_CYCLE, sequence=DEGREES)]
 
 
-def _about(pace: Pace, moved: MeanCycles, *, steady: bool) -> str:
+def _about(pace: CyclePhase, moved: MeanCycles, *, steady: bool) -> str:
     fewest, most = int(moved.cycles.min()), int(moved.cycles.max())
     count = f"{fewest} to {most} cycles" if fewest < most else f"{most} cycle{'s' * (most > 1)}"
     zero = "at the crest of the first driven joint's command (no phase was logged)"
@@ -185,7 +185,7 @@ def _about(pace: Pace, moved: MeanCycles, *, steady: bool) -> str:
 
 def _log_body(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     look: Look,
     cycles: tuple[MeanCycles, MeanCycles | None, MeanCycles | None],
 ) -> bool:
@@ -224,7 +224,7 @@ def _log_body(
 
 def _log_shapes(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     kind: tuple[str, rr.Capsules3D],
     robot: Robot,
     drawn: tuple[FloatArray, NDArray[np.uint8]],
@@ -287,10 +287,10 @@ def _log_joints(
     names: tuple[str, ...],
     values: FloatArray,
     palette: Mapping[str, Color],
-) -> tuple[Series, ...]:
+) -> tuple[PlottedSeries, ...]:
     """Draw a line for each joint; ``values`` of shape (p, k)."""
     if not names:
         return ()
     log_look(rec, entity, names, palette)
     _send(rec, entity, values)
-    return (Series(entity, names),)
+    return (PlottedSeries(entity, names),)

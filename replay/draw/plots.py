@@ -29,15 +29,15 @@ from ..samples.content import (
     MECHANICAL,
     SCALARS,
     TOTAL,
+    BodyPlaces,
     Color,
     Content,
-    Places,
-    Series,
-    Signal,
+    PlottedSeries,
+    PlottedSignal,
     signal_title,
 )
 from ..samples.quantities import SIGNALS, topic_entity
-from ..samples.timeline import Clock, stretch_length_ns
+from ..samples.timeline import TimeColumns, stretch_length_ns
 from ..samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
 from .lines import (
     DEGREES,
@@ -78,8 +78,8 @@ def is_foreign(session: SessionView) -> bool:
 
 
 def log_others(
-    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
-) -> tuple[Signal, ...]:
+    rec: rr.RecordingStream, clock: TimeColumns, session: SessionView, warnings: list[str]
+) -> tuple[PlottedSignal, ...]:
     """Plot the numbers of every other topic of a foreign bag.
 
     Args:
@@ -88,7 +88,7 @@ def log_others(
     Returns:
         A signal a topic; none for a session of undulog's own.
     """
-    signals: list[Signal] = []
+    signals: list[PlottedSignal] = []
     left_out: list[str] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS:
@@ -104,13 +104,15 @@ def log_others(
             values = table.reindex(columns=list(lines)).to_numpy(np.float64)
             t_ns = table.index.to_numpy(dtype=np.int64)
             log_rows(rec, clock, entity, *mark_gaps(*ordered(t_ns, values)))
-        signals.append(Signal(topic.lstrip("/"), (Series(entity, lines),), of_joints=False))
+        signals.append(
+            PlottedSignal(topic.lstrip("/"), (PlottedSeries(entity, lines),), of_joints=False)
+        )
     if left_out:
         warnings.append(f"not shown: {', '.join(left_out)}")
     return tuple(signals)
 
 
-def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
+def log_words(rec: rr.RecordingStream, clock: TimeColumns, session: SessionView) -> bool:
     """Write String topics of a foreign bag as events, each time that their value changes."""
     words: list[tuple[int, str]] = []
     for topic, channel in _others(session):
@@ -212,7 +214,7 @@ class Plot:
         """
         paths = part_entities(entity, parts)
         self.series = tuple(
-            Series(path, part, component) for path, part in zip(paths, parts, strict=True)
+            PlottedSeries(path, part, component) for path, part in zip(paths, parts, strict=True)
         )
         """What is written."""
         self._degrees = degrees
@@ -231,7 +233,7 @@ class Plot:
     def write(
         self,
         rec: rr.RecordingStream,
-        clock: Clock,
+        clock: TimeColumns,
         tracks: Sequence[Track],
         rows: Rows = every_row,
         known_ns: int | None = None,
@@ -271,9 +273,9 @@ class Plots:
     def __init__(
         self,
         rec: rr.RecordingStream,
-        clock: Clock,
+        clock: TimeColumns,
         parts: Mapping[str, Sequence[tuple[str, ...]]],
-        places: Places | None,
+        places: BodyPlaces | None,
         palette: Mapping[str, Color],
         *,
         samples: Mapping[str, Sequence[Track]] = MappingProxyType({}),
@@ -307,7 +309,7 @@ class Plots:
             for source, kind in ((COMMANDED, "commanded"), (MEASURED, "measured")):
                 self._add_places(parts.get(source, ()), places, samples, source, kind)
 
-    def series(self, entity: str) -> tuple[Series, ...]:
+    def series(self, entity: str) -> tuple[PlottedSeries, ...]:
         """Return the series that are written of a quantity.
 
         Args:
@@ -351,9 +353,9 @@ class Plots:
         for source, plot in self._places.items():
             plot.write(self._rec, self._clock, tracks.get(source, ()), rows, known_ns)
 
-    def _signals(self, units: Mapping[str, str]) -> tuple[Signal, ...]:
+    def _signals(self, units: Mapping[str, str]) -> tuple[PlottedSignal, ...]:
         """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
-        signals: list[Signal] = []
+        signals: list[PlottedSignal] = []
         topics = {topic_entity(SIGNALS, topic): topic for topic in units}
         for entity, plot in self._plots.items():
             if entity.startswith(f"{SIGNALS}/"):
@@ -361,13 +363,15 @@ class Plots:
                 of_joints = any(
                     name in self._palette for series in plot.series for name in series.names
                 )
-                signals.append(Signal(signal_title(topic, units[topic]), plot.series, of_joints))
+                signals.append(
+                    PlottedSignal(signal_title(topic, units[topic]), plot.series, of_joints)
+                )
         return tuple(signals)
 
     def _add_places(
         self,
         parts: Sequence[tuple[str, ...]],
-        places: Places,
+        places: BodyPlaces,
         samples: Mapping[str, Sequence[Track]],
         source: str,
         kind: str,

@@ -13,13 +13,13 @@ from rerun.components import FillMode
 
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
-from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.common.strict_table import Faults, StrictTable
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world
 
-from ..samples.timeline import Clock, Span, Stretch
+from ..samples.timeline import DrawnSpan, SpanSamples, TimeColumns
 from ..samples.tracks import decimate, gaps, hold, ordered
 from . import body
 from .body import ROUNDING, Look, rounded_to
@@ -35,7 +35,7 @@ TRAIL_RATE_HZ = 10.0
 TRAIL_SECONDS = 20.0
 
 _COLOR = (104, 108, 128, 255)
-_WHOLE = Span()
+_WHOLE = DrawnSpan()
 
 CYLINDERS = "/world/obstacles/cylinders"
 BOXES = "/world/obstacles/boxes"
@@ -120,7 +120,7 @@ def range_sensors(robot: Robot, topics: Collection[str]) -> tuple[Sensor, ...]:
 
 def log_rays(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     motion: Motion,
     chosen: IntArray,
     *,
@@ -166,7 +166,7 @@ def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDAr
 
 def log_trail(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     head: HeadPath,
     rows: Callable[[IntArray], slice] = _WHOLE.rows,
     origin_ns: int | None = None,
@@ -206,7 +206,7 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
         warnings.append(f"the attached scenario can't be read, obstacles are not drawn: {error}")
         return None
     faults = Faults()
-    world = read_world(Table(values, "", faults).table("world"), None, 0)
+    world = read_world(StrictTable(values, "", faults).table("world"), None, 0)
     if found := faults.all():
         reason = "; ".join(map(str, found))
         warnings.append(f"the attached scenario has faults, obstacles are not drawn: {reason}")
@@ -257,7 +257,7 @@ def _rim(target: Target) -> rr.LineStrips3D:
 
 def log_motion(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     motion: Motion,
     sparse: IntArray,
     *,
@@ -283,14 +283,14 @@ class Scene:
     def __init__(
         self,
         rec: rr.RecordingStream,
-        clock: Clock,
+        clock: TimeColumns,
         session: SessionView,
         robot: Robot,
         head: HeadPath,
         *,
         look: Look,
         warnings: list[str],
-        span: Span,
+        span: DrawnSpan,
     ) -> None:
         """Draw the static surroundings and the head's trail.
 
@@ -310,7 +310,7 @@ class Scene:
         if head.tracked:
             log_trail(rec, clock, head, span.rows)
 
-    def write(self, stretch: Stretch) -> None:
+    def write(self, stretch: SpanSamples) -> None:
         """Draw a stretch."""
         rows = stretch.span.rows(self._head.t_ns)
         if rows.stop <= rows.start:

@@ -41,11 +41,11 @@ from ..samples.content import (
     Bar,
     Chart,
     Color,
+    CycleQuantity,
     CycleTable,
-    Quantity,
-    Series,
+    PlottedSeries,
 )
-from ..samples.timeline import Clock
+from ..samples.timeline import TimeColumns
 from ..samples.tracks import Track
 from ..samples.tracks import tables as tables_of
 from .lines import log_look, log_rows, part_entities
@@ -111,10 +111,10 @@ def together(tables: Sequence[CycleTable]) -> CycleTable:
 
 def log_cycles(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     tables: Sequence[CycleTable],
     palette: Mapping[str, Color],
-) -> tuple[tuple[Quantity, tuple[Series, ...]], ...]:
+) -> tuple[tuple[CycleQuantity, tuple[PlottedSeries, ...]], ...]:
     """Write the steps.
 
     Args:
@@ -123,17 +123,17 @@ def log_cycles(
     Returns:
         Each quantity with where it was written.
     """
-    quantities: list[tuple[Quantity, tuple[Series, ...]]] = []
+    quantities: list[tuple[CycleQuantity, tuple[PlottedSeries, ...]]] = []
     for quantity in dict.fromkeys(table.quantity for table in tables):
         own = [_steps(table, clock.start_ns) for table in tables if table.quantity == quantity]
         parts = tables_of(list(chain.from_iterable(own)))
         paths = part_entities(f"{CYCLES}/{quantity.key}", [part.names for part in parts])
-        series: list[Series] = []
+        series: list[PlottedSeries] = []
         for entity, part in zip(paths, parts, strict=True):
             log_look(rec, entity, part.names, palette, steps=True)
             rec.flush()  # else what comes first in the file is chance
             log_rows(rec, clock, entity, part.t_ns, part.values)
-            series.append(Series(entity, part.names))
+            series.append(PlottedSeries(entity, part.names))
         quantities.append((quantity, tuple(series)))
     return tuple(quantities)
 
@@ -287,7 +287,7 @@ def log_bar(
 
 def log_current(
     rec: rr.RecordingStream,
-    clock: Clock,
+    clock: TimeColumns,
     found: Sequence[Chart],
     tables: Sequence[CycleTable],
 ) -> None:
@@ -298,7 +298,7 @@ def log_current(
             _log_rows(rec, clock, chart, together(parts))
 
 
-def _log_rows(rec: rr.RecordingStream, clock: Clock, chart: Chart, table: CycleTable) -> None:
+def _log_rows(rec: rr.RecordingStream, clock: TimeColumns, chart: Chart, table: CycleTable) -> None:
     place = {bar.joint: bar.place for bar in chart.bars}
     row = [i for i, name in enumerate(table.names) if name in place]
     left = np.array([place[table.names[i]] + _CURRENT_LEFT for i in row])

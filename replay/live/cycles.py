@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate, weigh
+from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, LoggedPhase, demodulate, weigh
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.session.cycles import LEAST_COVERED, LoggedGait
 from undulog.analysis.signals.columns import planes_of
@@ -24,12 +24,12 @@ from undulog.capture.robot.model import Robot
 from ..draw.heat_maps import POWER
 from ..draw.plots import Plot
 from ..draw.steps import CYCLES, SEGMENTS
-from ..samples.content import GAIN, LAG, Chart, Color, Quantity
-from ..samples.content import Series as Lines
+from ..samples.content import GAIN, LAG, Chart, Color, CycleQuantity
+from ..samples.content import PlottedSeries as Lines
 from ..samples.quantities import GAIT, products, refined
-from ..samples.timeline import SESSION_TIME, Clock
+from ..samples.timeline import SESSION_TIME, TimeColumns
 from ..samples.tracks import Track, one_after_another
-from .decode import PATIENCE_NS, Batch
+from .decode import PATIENCE_NS, SampleBatch
 
 KEPT_S = 60.0
 """A cycle and its surroundings that last longer than this are not computed [s]."""
@@ -90,7 +90,7 @@ class CycleMeter:
         self._largest: dict[str, float] = {}  # of each joint's commands
         self._newest_ns = 0
 
-    def add(self, batch: Batch, robot: Robot | None) -> list[Cycle]:
+    def add(self, batch: SampleBatch, robot: Robot | None) -> list[Cycle]:
         """Take new samples.
 
         Args:
@@ -224,7 +224,7 @@ class CycleMeter:
         gain, lag, power = (np.full(len(joints), np.nan) for _ in range(3))
         for i, joint in enumerate(joints):
             own = run.phase_name(joint, planes.get(joint, "")) or ""
-            phase = Phase(run.t_s[near], _whole(run.values[own])[near])
+            phase = LoggedPhase(run.t_s[near], _whole(run.values[own])[near])
             command, response = self._series(_COMMAND, joint), self._series(_POSITION, joint)
             if command.count > 1 and response.count > 1 and np.ptp(command.values) > 0.0:
                 asked, given = demodulate(command, response, phase, edges_s)
@@ -280,9 +280,9 @@ class CycleBars:
 
     def __init__(self) -> None:
         """Nothing has been drawn."""
-        self._plots: dict[Quantity, Plot] = {}
+        self._plots: dict[CycleQuantity, Plot] = {}
         self._drawn: set[str] = set()
-        self._waiting: deque[tuple[Quantity, Cycle, FloatArray]] = deque()
+        self._waiting: deque[tuple[CycleQuantity, Cycle, FloatArray]] = deque()
 
     @property
     def charts(self) -> tuple[Chart, ...]:
@@ -293,7 +293,7 @@ class CycleBars:
         )
 
     @property
-    def cycles(self) -> tuple[tuple[Quantity, tuple[Lines, ...]], ...]:
+    def cycles(self) -> tuple[tuple[CycleQuantity, tuple[Lines, ...]], ...]:
         """The quantities whose steps have been written, each with where."""
         return tuple(
             (quantity, self._plots[quantity].series)
@@ -314,7 +314,7 @@ class CycleBars:
     def write(
         self,
         rec: rr.RecordingStream,
-        clock: Clock,
+        clock: TimeColumns,
         palette: Mapping[str, Color],
         *,
         everything: bool = False,
@@ -346,7 +346,7 @@ class CycleBars:
     def _write_bars(
         self,
         rec: rr.RecordingStream,
-        quantity: Quantity,
+        quantity: CycleQuantity,
         tracks: Sequence[Track],
         palette: Mapping[str, Color],
     ) -> None:

@@ -46,7 +46,7 @@ Samples = tuple[IntArray, FloatArray]
 
 
 @dataclass
-class Batch:
+class SampleBatch:
     """New samples.
 
     Attributes:
@@ -145,14 +145,14 @@ class LiveLog:
             case _:
                 pass
 
-    def decode(self, messages: Iterable[LiveMessage]) -> Batch:
+    def decode(self, messages: Iterable[LiveMessage]) -> SampleBatch:
         """Read messages.
 
         Args:
             messages: In the order of their sequence numbers.
         """
         by_channel: dict[int, list[LiveMessage]] = {}
-        batch = Batch()
+        batch = SampleBatch()
         for message in messages:
             by_channel.setdefault(message.channel_id, []).append(message)
             batch.messages += 1
@@ -193,7 +193,7 @@ class LiveLog:
 
     # -- messages --------------------------------------------------------------------------
 
-    def _read(self, topic: _Topic, messages: Sequence[LiveMessage], batch: Batch) -> None:
+    def _read(self, topic: _Topic, messages: Sequence[LiveMessage], batch: SampleBatch) -> None:
         name, type_name = topic.channel.topic, topic.schema.name
         if type_name == JOINT_STATE:
             self._read_joints(topic, messages, batch)
@@ -219,7 +219,9 @@ class LiveLog:
         t_ns = np.concatenate([group.t_ns for group in groups])
         return t_ns, np.concatenate(rows).astype(np.float64)
 
-    def _read_joints(self, topic: _Topic, messages: Sequence[LiveMessage], batch: Batch) -> None:
+    def _read_joints(
+        self, topic: _Topic, messages: Sequence[LiveMessage], batch: SampleBatch
+    ) -> None:
         name = topic.channel.topic
         fields = ("position", "velocity", "effort") if name == "/joint_states" else ("position",)
         groups = self._groups(topic, messages)

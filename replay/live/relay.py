@@ -31,7 +31,7 @@ from undulog.capture.recorder.live_wire import (
     HEAD_SIZE,
     MAX_DATAGRAM,
     DatagramHead,
-    Kind,
+    DatagramKind,
     LiveMessage,
     read_head,
     read_records,
@@ -137,7 +137,7 @@ class Inbox(AbstractContextManager["Inbox"]):
         while self._queue and self._bytes > self._max_bytes:
             oldest = self._queue.popleft()
             self._bytes -= len(oldest.data)
-            if oldest.head.kind is Kind.MESSAGES:
+            if oldest.head.kind is DatagramKind.MESSAGES:
                 self.dropped += oldest.head.messages
             else:
                 kept[_said(oldest)] = oldest
@@ -313,7 +313,7 @@ class Relay:
                 if not self._begin(datagram.head.feed_id):
                     return
             self._take(datagram, pending)
-            if datagram.head.kind is Kind.END:
+            if datagram.head.kind is DatagramKind.END:
                 self._draw(pending)
                 self._end()
         self._draw(pending)
@@ -350,13 +350,13 @@ class Relay:
     def _take(self, datagram: Datagram, pending: list[LiveMessage]) -> None:
         """Read a datagram: definitions at once, messages to be drawn."""
         self._dropped = max(self._dropped, datagram.head.dropped)
-        if datagram.head.kind is Kind.MESSAGES:
+        if datagram.head.kind is DatagramKind.MESSAGES:
             self.ended = False  # it was only silent
         try:
             for record in read_records(datagram.data):
                 if not isinstance(record, LiveMessage):
                     self._log.define(record)
-                elif datagram.head.kind is Kind.DEFINITIONS:
+                elif datagram.head.kind is DatagramKind.DEFINITIONS:
                     self._states.append(record)
                 else:
                     pending.append(record)

@@ -24,12 +24,12 @@ from ..draw.motion import HeadPath, assemble, frames_of, still_head
 from ..draw.plots import Plots
 from ..layout import build_blueprint
 from ..samples import content as entities
-from ..samples.content import Content, Start
+from ..samples.content import Content, InitialPose
 from ..samples.quantities import power_limit, quantities, refined
-from ..samples.timeline import Clock
+from ..samples.timeline import TimeColumns
 from ..samples.tracks import Columns, Track, hold, ordered, sampled_together
 from .cycles import CycleBars, CycleMeter
-from .decode import PATIENCE_NS, Batch, LiveLog
+from .decode import PATIENCE_NS, LiveLog, SampleBatch
 
 _LAYOUT_EVERY_S = 1.0
 _FACTS_EVERY_S = 2.0
@@ -66,7 +66,7 @@ class _Window:
         """All JointState columns."""
         return {key: tuple(tracks.values()) for key, tracks in self._tracks.items()}
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: SampleBatch) -> None:
         """Take new samples, and forget the oldest."""
         self.late_ns = None
         for key, tracks in batch.columns.items():
@@ -159,15 +159,15 @@ class LiveScene:
         """
         self._now_ns = now_ns
         self._rec, self._log, self._session_id = rec, log, session_id
-        self._clock = Clock(epoch_ns)
+        self._clock = TimeColumns(epoch_ns)
         self._window, self._fresh = _Window(), _Fresh()
         self._parts: dict[str, list[tuple[str, ...]]] = {}
-        self._places: entities.Places | None = None
+        self._places: entities.BodyPlaces | None = None
         self._palette: dict[str, entities.Color] = {}
         self._plots = Plots(rec, self._clock, {}, None, {})
         self._plotted: tuple[object, ...] = ()
         self._meter, self._bars = CycleMeter(epoch_ns), CycleBars()
-        self._start: Start | None = None
+        self._start: InitialPose | None = None
         self._origin_ns: int | None = None
         self._limit_w: float | None = None
         self._mode: str | None = None
@@ -191,7 +191,7 @@ class LiveScene:
             live=True,
         )
 
-    def draw(self, batch: Batch, dropped: int = 0) -> None:
+    def draw(self, batch: SampleBatch, dropped: int = 0) -> None:
         """Draw new samples.
 
         Args:
@@ -265,7 +265,7 @@ class LiveScene:
                 return
         self._places = found
 
-    def _draw_words(self, batch: Batch) -> None:
+    def _draw_words(self, batch: SampleBatch) -> None:
         turns: list[tuple[int, str]] = []
         for t_ns, mode in batch.modes:
             if t_ns > self._mode_ns:  # the current mode is repeated

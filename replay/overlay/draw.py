@@ -39,7 +39,7 @@ from ..draw.motion import HeadPath
 from ..draw.plots import Plot
 from ..draw.stage import TRAIL
 from ..draw.steps import bar_of, log_bar
-from ..samples.content import GREY, TOTAL, Bar, Color, Places, Series, line_title
+from ..samples.content import GREY, TOTAL, Bar, BodyPlaces, Color, PlottedSeries, line_title
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from ..samples.tracks import (
     Track,
@@ -178,7 +178,9 @@ def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
     return np.where(is_drawn[:, None], values, np.nan)
 
 
-def places_in(other: Side, first: Places | None, places: Places | None) -> Places | None:
+def places_in(
+    other: Side, first: BodyPlaces | None, places: BodyPlaces | None
+) -> BodyPlaces | None:
     """Return the joints of another session that stand for its body.
 
     Args:
@@ -191,7 +193,7 @@ def places_in(other: Side, first: Places | None, places: Places | None) -> Place
     return first if first is not None and set(first.names) <= known else places
 
 
-def log_lines(rec: rr.RecordingStream, side: Side, rank: int, places: Places | None) -> bool:
+def log_lines(rec: rr.RecordingStream, side: Side, rank: int, places: BodyPlaces | None) -> bool:
     """Write head, middle and tail of a session in degrees.
 
     Args:
@@ -229,7 +231,7 @@ def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ChartQuantity:
     """What the bars of one chart show.
 
     Attributes:
@@ -247,15 +249,15 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("gain", "Gain − 1 [%]", "Δ gain [%]", 1.0, 100.0),
-    Quantity("lag", "Lag [°]", "Δ lag [°]", 0.0, math.degrees(1.0)),
-    Quantity("energy_abs", "E_abs per cycle [J]", "Δ E_abs [J]", 0.0, 1.0),
+    ChartQuantity("gain", "Gain − 1 [%]", "Δ gain [%]", 1.0, 100.0),
+    ChartQuantity("lag", "Lag [°]", "Δ lag [°]", 0.0, math.degrees(1.0)),
+    ChartQuantity("energy_abs", "E_abs per cycle [J]", "Δ E_abs [J]", 0.0, 1.0),
 )
 
 
 def log_bars(
     rec: rr.RecordingStream, sides: Sequence[tuple[Side, ComparedSession]]
-) -> tuple[Quantity, ...]:
+) -> tuple[ChartQuantity, ...]:
     """Write the sessions' bars next to each other.
 
     Args:
@@ -282,7 +284,7 @@ def log_bars(
 
 def log_difference_bars(
     rec: rr.RecordingStream, first: Side, other: Side, comparison: Comparison | None
-) -> tuple[Quantity, ...]:
+) -> tuple[ChartQuantity, ...]:
     """Write how a session's joints respond differently from the first one's.
 
     Args:
@@ -364,8 +366,8 @@ def log_differences(
     a: Side,
     entity: str,
     differences: Sequence[Track],
-    drawn: Sequence[Series],
-) -> tuple[Series, ...]:
+    drawn: Sequence[PlottedSeries],
+) -> tuple[PlottedSeries, ...]:
     """Write differences as the angles of the session that was subtracted are drawn.
 
     Args:

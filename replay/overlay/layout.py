@@ -9,7 +9,7 @@ from typing import Any, cast
 import rerun.blueprint as rrb
 from rerun.encodings import EntityPathLike
 
-from undulog.analysis.results.comparison import Change, Comparison
+from undulog.analysis.results.comparison import Comparison, MetadataChange
 from undulog.analysis.results.formats import short, utc
 
 from ..draw import lines
@@ -19,8 +19,8 @@ from ..draw.drawing import FACTS as SESSION
 from ..draw.drawing import code, document, escaped, listed
 from ..draw.stage import TRAIL
 from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
-from ..samples.content import Content, Series
-from .draw import BARS, DIFFERENCES, LINES, POWER, Quantity
+from ..samples.content import Content, PlottedSeries
+from .draw import BARS, DIFFERENCES, LINES, POWER, ChartQuantity
 from .sessions import COMPARED, Align, Side
 
 FACTS = f"{COMPARED}/facts"
@@ -50,7 +50,7 @@ class Found:
 
     comparison: Comparison | None
     why_not: str | None
-    changed: tuple[Change, ...]
+    changed: tuple[MetadataChange, ...]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ def _table(sides: Sequence[Side]) -> str:
     return "\n".join(rows)
 
 
-def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
+def _changes(first: Side, other: Side, changed: Sequence[MetadataChange]) -> str:
     if not changed:
         return escaped(f"{other.name} is described as {first.name}: nothing was changed.")
     lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
@@ -129,7 +129,7 @@ def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
 
 
 @dataclass(frozen=True)
-class Shown:
+class SessionContent:
     """Content of a session in the recording.
 
     Attributes:
@@ -143,9 +143,9 @@ class Shown:
     side: Side
     content: Content
     lines: bool
-    differences: tuple[Series, ...] = ()
+    differences: tuple[PlottedSeries, ...] = ()
     apart: bool = False
-    bars: tuple[Quantity, ...] = ()
+    bars: tuple[ChartQuantity, ...] = ()
 
     @property
     def body(self) -> bool:
@@ -154,7 +154,7 @@ class Shown:
 
 
 def build_blueprint(
-    shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
+    shown: Sequence[SessionContent], bars: Sequence[ChartQuantity], how: Align, title: str
 ) -> rrb.Blueprint:
     """Lay out the content of a side by side recording.
 
@@ -193,7 +193,7 @@ def build_blueprint(
     return blueprint(root, panel)
 
 
-def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
+def _scene(bodies: Sequence[SessionContent], title: str) -> rrb.Spatial3DView:
     """Return the first body's own view of the world, with all bodies in it."""
     first = bodies[0]
     scene = build_views(first.content).scene
@@ -216,7 +216,7 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
     )
 
 
-def _both(shown: Sequence[Shown]) -> list[rrb.View]:
+def _both(shown: Sequence[SessionContent]) -> list[rrb.View]:
     views: list[rrb.View] = []
     if any(one.lines for one in shown):
         views.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
@@ -225,7 +225,7 @@ def _both(shown: Sequence[Shown]) -> list[rrb.View]:
     return views
 
 
-def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
+def _differences(shown: Sequence[SessionContent]) -> list[rrb.View]:
     """Return a view for each plane and session, and one of the distance of the heads."""
     first, *others = shown
     views: list[rrb.View] = []
@@ -239,14 +239,14 @@ def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
     return views
 
 
-def _bar_differences(one: Shown) -> list[rrb.View]:
+def _bar_differences(one: SessionContent) -> list[rrb.View]:
     return [
         bar_chart(f"{one.side.name}: {q.difference}", f"{one.side.own}{DIFFERENCES}/{q.key}/**")
         for q in one.bars
     ]
 
 
-def _words(shown: Sequence[Shown]) -> list[rrb.View]:
+def _words(shown: Sequence[SessionContent]) -> list[rrb.View]:
     views: list[rrb.View] = [rrb.TextDocumentView(name="Side by side", contents=[FACTS])]
     views += [
         rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])

@@ -36,7 +36,7 @@ from ..draw.lines import rhythm_of
 from ..draw.motion import HeadPath, read_head
 from ..recording import Recording, write_recording
 from ..samples.content import Color
-from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
+from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, LoggedRhythm, TimeColumns
 from ..samples.tracks import Track, gaps, interpolate, read_columns, resampled, wanted_fields
 
 COMPARED = "/compared"
@@ -82,19 +82,19 @@ class Side:
     robot: Robot | None
     measured: tuple[Track, ...]
     head: HeadPath | None
-    rhythm: Rhythm | None
+    rhythm: LoggedRhythm | None
     palette: Mapping[str, Color]
     facts: Mapping[str, str]
     zero_ns: int
     cycles: int = 0
 
     @property
-    def clock(self) -> Clock:
+    def clock(self) -> TimeColumns:
         """Timelines that place the session's samples on the common ones."""
         rhythm = self.rhythm
         if rhythm is not None:
-            rhythm = Rhythm(rhythm.t_ns, rhythm.cycles + self.cycles)
-        return Clock(self.zero_ns, rhythm)
+            rhythm = LoggedRhythm(rhythm.t_ns, rhythm.cycles + self.cycles)
+        return TimeColumns(self.zero_ns, rhythm)
 
     @property
     def entity(self) -> str:
@@ -254,7 +254,7 @@ def counterparts(a: Side, b: Side, how: Align, t_ns: IntArray) -> tuple[IntArray
     return times_of(other, interpolate(one.t_ns, one.cycles, t_ns))
 
 
-def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
+def times_of(rhythm: LoggedRhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
     """Return the times at which a gait first reached given phases.
 
     Args:

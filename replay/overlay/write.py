@@ -41,7 +41,7 @@ from ..samples.tracks import Track, decimate
 from ..stream import BoundedStream
 from . import draw
 from . import layout as words
-from .layout import SEPARATE, Found, Shown, build_blueprint
+from .layout import SEPARATE, Found, SessionContent, build_blueprint
 from .sessions import (
     Align,
     Placement,
@@ -159,7 +159,7 @@ class Overlay:
 
     path: Path
     recording_id: str
-    shown: tuple[Shown, ...]
+    shown: tuple[SessionContent, ...]
     found: Mapping[str, Found]
     placements: Mapping[str, Placement]
     warnings: tuple[str, ...]
@@ -259,11 +259,11 @@ def _log(
     found: Mapping[str, Found],
     placements: Mapping[str, Placement],
     how: Align,
-) -> tuple[Shown, ...]:
+) -> tuple[SessionContent, ...]:
     """Write the entities that aren't in the sessions' own recordings."""
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     a, content = sessions[0].side, sessions[0].recording.content
-    shown = [Shown(a, content, draw.log_lines(rec, a, 0, content.places))]
+    shown = [SessionContent(a, content, draw.log_lines(rec, a, 0, content.places))]
     for rank, session in enumerate(sessions[1:], start=1):
         b, own = session.side, session.recording.content
         placed = placements.get(b.name, Placement())
@@ -272,7 +272,7 @@ def _log(
         angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
         apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))
         bars = draw.log_difference_bars(rec, a, b, found[b.name].comparison)
-        shown.append(Shown(b, own, lines, angles, apart, bars))
+        shown.append(SessionContent(b, own, lines, angles, apart, bars))
     bodies = [one.side for one in shown if one.body]
     for rank, side in enumerate(bodies):
         _log_body(rec, side, rank, placements)
@@ -316,7 +316,7 @@ def _log_body(
         draw.log_placement(rec, side.entity, placements[side.name])
 
 
-def _title(shown: Sequence[Shown]) -> str:
+def _title(shown: Sequence[SessionContent]) -> str:
     """Return the name of the bodies' view, which names the sessions."""
     first, *others = [one.side.name for one in shown if one.body] or [""]
     if not others:
@@ -324,7 +324,7 @@ def _title(shown: Sequence[Shown]) -> str:
     return f"{first} solid, {' and '.join(others)} as wireframe"
 
 
-def _legend(shown: Sequence[Shown], title: str) -> str:
+def _legend(shown: Sequence[SessionContent], title: str) -> str:
     bodies = [one for one in shown if one.body]
     if not bodies:
         return "No session has the data to draw a body."

@@ -44,7 +44,7 @@ _UNITS = {"degC": "°C"}
 
 
 @dataclass(frozen=True)
-class Series:
+class PlottedSeries:
     """An entity with one plotted line a joint.
 
     Attributes:
@@ -57,7 +57,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Places:
+class BodyPlaces:
     """The joints that stand for head, middle and tail.
 
     Attributes:
@@ -85,7 +85,7 @@ def line_title(name: str, label: str) -> str:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class CycleQuantity:
     """Quantity of a table of cycles.
 
     Attributes:
@@ -98,9 +98,9 @@ class Quantity:
     unit: str
 
 
-GAIN = Quantity("gain_minus_one_percent", "Gain − 1", "%")
-LAG = Quantity("lag_degrees", "Lag", "°")
-ENERGY = Quantity("energy_net_joule", "Net energy", "J/cycle")
+GAIN = CycleQuantity("gain_minus_one_percent", "Gain − 1", "%")
+LAG = CycleQuantity("lag_degrees", "Lag", "°")
+ENERGY = CycleQuantity("energy_net_joule", "Net energy", "J/cycle")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class CycleTable:
         value: In the quantity's unit, NaN where it isn't known, shape (m, c).
     """
 
-    quantity: Quantity
+    quantity: CycleQuantity
     names: tuple[str, ...]
     start_s: FloatArray
     stop_s: FloatArray
@@ -208,9 +208,9 @@ class MeanCycle:
     period_s: float
     has_body: bool
     has_places: bool
-    measured: tuple[Series, ...]
-    error: tuple[Series, ...]
-    power: tuple[Series, ...]
+    measured: tuple[PlottedSeries, ...]
+    error: tuple[PlottedSeries, ...]
+    power: tuple[PlottedSeries, ...]
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def signal_title(topic: str, unit: str) -> str:
 
 
 @dataclass(frozen=True)
-class Signal:
+class PlottedSignal:
     """A quantity of all joints that is shown as logged.
 
     Attributes:
@@ -274,12 +274,12 @@ class Signal:
     """
 
     title: str
-    series: tuple[Series, ...]
+    series: tuple[PlottedSeries, ...]
     of_joints: bool
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialPose:
     """Return the initial pose of the robot, for the camera.
 
     Attributes:
@@ -323,19 +323,19 @@ class Content:
     """
 
     robot: Robot | None
-    start: Start | None = None
+    start: InitialPose | None = None
     power_limit_w: float | None = None
-    places: Places | None = None
-    commanded: tuple[Series, ...] = ()
-    measured: tuple[Series, ...] = ()
-    errors: tuple[Series, ...] = ()
+    places: BodyPlaces | None = None
+    commanded: tuple[PlottedSeries, ...] = ()
+    measured: tuple[PlottedSeries, ...] = ()
+    errors: tuple[PlottedSeries, ...] = ()
     has_power: bool = False
-    joint_power: tuple[Series, ...] = ()
+    joint_power: tuple[PlottedSeries, ...] = ()
     charts: tuple[Chart, ...] = ()
     modes: int = 0
     has_events: bool = False
-    signals: tuple[Signal, ...] = ()
+    signals: tuple[PlottedSignal, ...] = ()
     live: bool = False
-    cycles: tuple[tuple[Quantity, tuple[Series, ...]], ...] = ()
+    cycles: tuple[tuple[CycleQuantity, tuple[PlottedSeries, ...]], ...] = ()
     maps: tuple[HeatMap | AwaitedMap, ...] = ()
     mean: MeanCycle | None = None

@@ -38,7 +38,7 @@ ROWS_PER_CHUNK = 4096
 
 
 @dataclass(frozen=True)
-class Span:
+class DrawnSpan:
     """The part of a session that is drawn at a time, half-open.
 
     Attributes:
@@ -62,16 +62,16 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SpanSamples:
     """Samples of a span, and of a little before and after it."""
 
-    span: Span
+    span: DrawnSpan
     columns: Columns
 
 
 def stretches(
     session: SessionView, wanted: Mapping[str, Sequence[str]], context_ns: int
-) -> Iterator[Stretch]:
+) -> Iterator[SpanSamples]:
     """Read a session stretch by stretch.
 
     Args:
@@ -90,9 +90,11 @@ def stretches(
         known_ns = None if high is None else high + context_ns
         begin_ns = None if low is None else low - context_ns
         columns = read_columns(session, wanted, start_ns=begin_ns, stop_ns=known_ns)
-        span = Span(_FIRST_NS if low is None else low, _LAST_NS if high is None else high, known_ns)
+        span = DrawnSpan(
+            _FIRST_NS if low is None else low, _LAST_NS if high is None else high, known_ns
+        )
         session.forget()
-        yield Stretch(span, columns)
+        yield SpanSamples(span, columns)
 
 
 def stretch_length_ns(session: SessionView, least_ns: int = 0) -> int:
@@ -131,7 +133,7 @@ def _laborious(session: SessionView, length_ns: int) -> bool:
 
 
 @dataclass(frozen=True)
-class Rhythm:
+class LoggedRhythm:
     """The gait's phase as it was logged.
 
     Attributes:
@@ -143,7 +145,7 @@ class Rhythm:
     cycles: FloatArray
 
     @classmethod
-    def from_phase(cls, t_ns: IntArray, phase_rad: FloatArray) -> Rhythm:
+    def from_phase(cls, t_ns: IntArray, phase_rad: FloatArray) -> LoggedRhythm:
         """Count cycles from a phase that may be wrapped.
 
         Args:
@@ -158,7 +160,7 @@ class Rhythm:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeColumns:
     """Turns sampling times into Rerun's time columns.
 
     Attributes:
@@ -167,7 +169,7 @@ class Clock:
     """
 
     start_ns: int
-    rhythm: Rhythm | None = None
+    rhythm: LoggedRhythm | None = None
 
     def rows(self, t_ns: IntArray) -> Iterator[tuple[slice, list[rr.TimeColumn]]]:
         """Cut rows into chunks that share their timelines.

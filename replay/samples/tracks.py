@@ -62,7 +62,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Table:
+class TrackTable:
     """Joints that were sampled at the same times.
 
     Attributes:
@@ -175,7 +175,7 @@ def one_after_another(pieces: Sequence[Track]) -> Track:
     return Track(pieces[0].name, t_ns, np.concatenate([piece.values for piece in pieces]))
 
 
-def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
+def tables(tracks: Sequence[Track]) -> tuple[TrackTable, ...]:
     """Put joints that were sampled at the same times into one table each.
 
     Args:
@@ -186,7 +186,7 @@ def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
         times.
     """
     return tuple(
-        Table(
+        TrackTable(
             tuple(track.name for track in group),
             group[0].t_ns,
             np.stack([track.values for track in group], axis=1),
@@ -218,7 +218,7 @@ def in_turn(first: IntArray, other: IntArray) -> bool:
     return inner.size >= max(first.size - 2, 1) and bool(np.all(np.diff(inner) == 1))
 
 
-def join_tracks(tracks: Sequence[Track]) -> Table:
+def join_tracks(tracks: Sequence[Track]) -> TrackTable:
     """Return joints as one table at the times of the first of them.
 
     Args:
@@ -230,7 +230,7 @@ def join_tracks(tracks: Sequence[Track]) -> Table:
     """
     first = tracks[0]
     values = [interpolate(track.t_ns, track.values, first.t_ns) for track in tracks]
-    return Table(tuple(track.name for track in tracks), first.t_ns, np.stack(values, axis=1))
+    return TrackTable(tuple(track.name for track in tracks), first.t_ns, np.stack(values, axis=1))
 
 
 def resampled(

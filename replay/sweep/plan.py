@@ -39,9 +39,9 @@ import numpy as np
 from undulog.analysis.signals.stretch import Options
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.config import Count, Positive, read_fields
-from undulog.capture.common.errors import Fault, PlanError
+from undulog.capture.common.errors import DescriptionFault, PlanError
 from undulog.capture.common.files import read_input
-from undulog.capture.common.strict_table import Faults, Table, at_least, shown
+from undulog.capture.common.strict_table import Faults, StrictTable, at_least, shown
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.sim.scenario.scenario import Kernels
 
@@ -161,9 +161,9 @@ def read_plan(path: Path) -> SweepPlan:
     try:
         values = read_toml(text.decode())
     except ValueError as error:
-        raise PlanError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
+        raise PlanError(path, [DescriptionFault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
-    top = Table(values, "", faults)
+    top = StrictTable(values, "", faults)
     plan = read_fields(top, SweepPlan, parameters=lambda: _parameters(top))
     top.close()
     if len(plan.scenario) > _LONGEST_NAME or not plan.scenario.isprintable():
@@ -174,7 +174,7 @@ def read_plan(path: Path) -> SweepPlan:
     return plan
 
 
-def _check_size(top: Table, plan: SweepPlan) -> None:
+def _check_size(top: StrictTable, plan: SweepPlan) -> None:
     """Note a plan whose runs no computer would hold or end."""
     if len(plan.parameters) > _MOST_PARAMETERS:
         return  # noted before
@@ -190,7 +190,7 @@ def _check_size(top: Table, plan: SweepPlan) -> None:
         top.fault("points", valid, f"{runs} runs of {longest} characters")
 
 
-def _parameters(top: Table) -> tuple[Parameter, ...]:
+def _parameters(top: StrictTable) -> tuple[Parameter, ...]:
     name, value = top.look("parameters")
     if not isinstance(value, dict) or not value:
         top.fault(name, 'a table a parameter, e.g. [parameters."servo.stall_torque"]')
@@ -207,7 +207,7 @@ def _parameters(top: Table) -> tuple[Parameter, ...]:
     return found
 
 
-def _parameter(key: str, table: Table) -> Parameter:
+def _parameter(key: str, table: StrictTable) -> Parameter:
     if "values" in table:
         _, values = table.look("values")
         if not isinstance(values, list) or not values:

@@ -29,8 +29,14 @@ from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.config import read
-from undulog.capture.common.errors import Fault, PlanError, RobotFileError, UndulogError, UsageError
-from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.common.errors import (
+    DescriptionFault,
+    PlanError,
+    RobotFileError,
+    UndulogError,
+    UsageError,
+)
+from undulog.capture.common.strict_table import Faults, StrictTable
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
@@ -163,7 +169,7 @@ def options_of(setting: Setting, changes: Mapping[str, Any]) -> Options:
     of_analysis = {k.removeprefix("analysis."): v for k, v in changes.items() if _of(k, "analysis")}
     faults = Faults()
     given = {key: value for key, value in asdict(setting.options).items() if value is not None}
-    options = read(Table(given | of_analysis, "analysis", faults), Options)
+    options = read(StrictTable(given | of_analysis, "analysis", faults), Options)
     if found := faults.all():
         raise PlanError(setting.name, found)
     return options
@@ -184,7 +190,9 @@ def _changed_robot(name: str, robot: RobotText, changes: Mapping[str, Any]) -> R
         for part in path:
             table = table.setdefault(part, {}) if hasattr(table, "setdefault") else None
         if not hasattr(table, "setdefault"):
-            fault = Fault(key, "a part of what is no table", "a key of a table of the robot")
+            fault = DescriptionFault(
+                key, "a part of what is no table", "a key of a table of the robot"
+            )
             raise RobotFileError(source, [fault])
         table[last] = value
     return parse_robot(tomlkit.dumps(values), source, robot.databases)

@@ -121,7 +121,7 @@ Lanes = Callable[..., None]
 """A loop over the runs of a block."""
 
 
-class Joint(NamedTuple):
+class JointPasses(NamedTuple):
     """The passes of the algorithm over a joint of one plane."""
 
     forward: Lanes
@@ -129,7 +129,7 @@ class Joint(NamedTuple):
     accelerate: Lanes
 
 
-def _joint(vertical: bool) -> Joint:
+def _joint(vertical: bool) -> JointPasses:
     """Compile the passes over a joint about y (vertical) or z."""
     Y, Z, SIGN = (2, 1, -1.0) if vertical else (1, 2, 1.0)
     IXY, IXZ, IYY, IYZ, IZZ = (
@@ -281,7 +281,7 @@ def _joint(vertical: bool) -> Joint:
             link[RATE, r] = after
             link[ANGLE, r] += dt * after
 
-    return Joint(forward, backward, accelerate)
+    return JointPasses(forward, backward, accelerate)
 
 
 YAW_FORWARD, YAW_BACKWARD, YAW_ACCELERATE = _joint(vertical=False)

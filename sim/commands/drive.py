@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import Line, each, sessions_of, show
+from undulog.capture.commands.sessions import SessionLine, each, sessions_of, show
 from undulog.capture.commands.topic_options import CommandTopic
 from undulog.capture.common.console import (
     UNLIMITED,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..drive.motion import MotionSource
     from ..drive.report import BusReport
     from ..scenario.scenario import Scenario
-    from ..twin.recording import Recording
+    from ..twin.recording import TwinRecording
 
 _TWIN = "twin"
 _CONTRACT = CommandTopic()
@@ -152,13 +152,13 @@ def _only_recorder() -> Path | None:
 
 def _dry_runs(
     whats: Sequence[str], on: str, robot: Robot | None, duration_s: float | None, topic: str
-) -> dict[str, Line]:
+) -> dict[str, SessionLine]:
     """Run motions in the twin, through the gate of a bus, one after the other."""
     from ..drive.dry_run import dry_run, reported, summary_lines
     from ..drive.motion import find_motion
     from ..drive.over_bus import check_drivable
 
-    def line(what: str) -> Line:
+    def line(what: str) -> SessionLine:
         driven = find_motion(what, robot=robot, command_topic=topic)
         check_drivable(driven, robot or driven.robot)
         with interruptible() as stop:
@@ -167,7 +167,7 @@ def _dry_runs(
             raise KeyboardInterrupt
         first, verdict = next(iter(summary_lines(dry, UNLIMITED))), dry.verdict
         facts = {"on": on, **reported(dry)}
-        return Line(dry.scenario.robot.name, driven.name, verdict, first, facts, verdict.fit)
+        return SessionLine(dry.scenario.robot.name, driven.name, verdict, first, facts, verdict.fit)
 
     return each(whats, "dry run", line)
 
@@ -180,7 +180,7 @@ def _twin_runs(
     topic: str,
     *,
     force: bool,
-) -> dict[str, Line]:
+) -> dict[str, SessionLine]:
     """Drive motions on the twin, one after the other, each into a session of its name."""
     from ..drive.in_process import drive_twin
     from ..drive.motion import find_motion
@@ -196,7 +196,7 @@ def _twin_runs(
     except OSError as error:
         raise LogWriteError(folder, f"no folder can be made: {error.strerror or error}") from error
 
-    def line(what: str) -> Line:
+    def line(what: str) -> SessionLine:
         driven = find_motion(what, world, command_topic=topic)
         scenario = driven.scenario(world, duration_s)
         start = time.monotonic()
@@ -207,7 +207,7 @@ def _twin_runs(
         factor = recording.duration_s / (time.monotonic() - start)
         facts = _reported(driven, scenario, recording, factor)
         first = _summary(driven, scenario, recording, factor)[0]
-        return Line(scenario.robot.name, driven.name, "good", first, facts)
+        return SessionLine(scenario.robot.name, driven.name, "good", first, facts)
 
     return each(whats, "drive", line)
 
@@ -329,7 +329,7 @@ def drive(
 
 
 def _reported(
-    driven: MotionSource, scenario: Scenario, recording: Recording, factor: float
+    driven: MotionSource, scenario: Scenario, recording: TwinRecording, factor: float
 ) -> dict[str, Any]:
     return {
         "driven": driven.name,
@@ -347,7 +347,7 @@ def _reported(
 
 
 def _summary(
-    driven: MotionSource, scenario: Scenario, recording: Recording, factor: float
+    driven: MotionSource, scenario: Scenario, recording: TwinRecording, factor: float
 ) -> list[str]:
     if recording.complete:
         first = f"{recording.path}: drove {driven.name} for {recording.duration_s:g} s"

@@ -17,7 +17,7 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import (
     UNLIMITED,
-    Column,
+    TerminalColumn,
     emit,
     output_width,
     progress,
@@ -29,10 +29,14 @@ from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
     from ..scenario.scenario import Kernels, Scenario
-    from ..twin.recording import Recording
+    from ..twin.recording import TwinRecording
     from ..twin.twin import Sample
 
-_COLUMNS = (Column("key", left=True), Column("value", left=True), Column("unit", left=True))
+_COLUMNS = (
+    TerminalColumn("key", left=True),
+    TerminalColumn("value", left=True),
+    TerminalColumn("unit", left=True),
+)
 _HEAD = ("name", "description", "robot")
 
 _UNITS = (
@@ -223,8 +227,8 @@ def speed_text(time_s: float, start: float) -> str:
 
 
 def with_progress(
-    name: str, scenario: Scenario, run: Callable[..., Recording]
-) -> tuple[Recording, float]:
+    name: str, scenario: Scenario, run: Callable[..., TwinRecording]
+) -> tuple[TwinRecording, float]:
     """Record a run of the twin with a progress bar, until its end or a signal.
 
     Args:
@@ -273,14 +277,14 @@ def _described(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _closure(recording: Recording) -> float | None:
+def _closure(recording: TwinRecording) -> float | None:
     """Greater of the two residuals, as a share of the absolute mechanical work."""
     energy = recording.energy
     worst = max(abs(energy["mechanical_residual"]), abs(energy["electrical_residual"]))
     return worst / energy["mechanical_abs"] if energy["mechanical_abs"] > 0 else None
 
 
-def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[str, Any]:
+def _reported(scenario: Scenario, recording: TwinRecording, factor: float) -> dict[str, Any]:
     return {
         "path": str(recording.path),
         "session_id": recording.session_id,
@@ -300,7 +304,7 @@ def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[s
     }
 
 
-def _summary(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+def _summary(scenario: Scenario, recording: TwinRecording, factor: float) -> list[str]:
     energy, closure = recording.energy, _closure(recording)
     robot = scenario.robot
     if recording.complete:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.common.console import Column, table
+from undulog.capture.common.console import TerminalColumn, table
 from undulog.capture.common.errors import SimulationError, some_names
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.model import Robot, Safety
@@ -62,7 +62,7 @@ _SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
 }
 
 
-class Verdict(StrEnum):
+class DryRunVerdict(StrEnum):
     """Verdict of a dry run."""
 
     RUNS = "would run"
@@ -74,7 +74,7 @@ class Verdict(StrEnum):
     @property
     def fit(self) -> bool:
         """Whether the drive would reach its end."""
-        return self in (Verdict.RUNS, Verdict.CLAMPED)
+        return self in (DryRunVerdict.RUNS, DryRunVerdict.CLAMPED)
 
 
 @dataclass(frozen=True)
@@ -112,17 +112,17 @@ class DryRun:
     path: Path | None = None
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> DryRunVerdict:
         """The verdict."""
         if self.missing:
-            return Verdict.REFUSED
+            return DryRunVerdict.REFUSED
         if self.fault is not None:
-            return Verdict.STOPS
+            return DryRunVerdict.STOPS
         if not self.complete:
-            return Verdict.UNFINISHED
+            return DryRunVerdict.UNFINISHED
         if self.cut or any(joint.clamped for joint in self.joints):
-            return Verdict.CLAMPED
-        return Verdict.RUNS
+            return DryRunVerdict.CLAMPED
+        return DryRunVerdict.RUNS
 
     @property
     def closest(self) -> tuple[str, Demand] | None:
@@ -271,25 +271,25 @@ def _share(name: str) -> Callable[[JointDemand], str]:
     return cell
 
 
-_COLUMNS: tuple[tuple[Column, Callable[[JointDemand], str]], ...] = (
-    (Column("joint", left=True), lambda joint: joint.name),
-    (Column("from °", spare=4), lambda joint: _degrees(joint.least)),
-    (Column("to °", spare=4), lambda joint: _degrees(joint.greatest)),
-    (Column("%"), _share("range")),
-    (Column("°/s", spare=5), lambda joint: _degrees(joint.rate, ".0f")),
-    (Column("%"), _share("rate")),
-    (Column("°/s²", spare=1), lambda joint: _degrees(joint.acceleration, ".0f")),
-    (Column("error °", spare=5), lambda joint: _degrees(joint.tracking_error)),
-    (Column("%"), _share("tracking error")),
-    (Column("N m", spare=5), lambda joint: _number(joint.torque_peak, ".3f")),
-    (Column("%"), _share("torque")),
-    (Column("rms", spare=2), lambda joint: _number(joint.torque_rms, ".3f")),
-    (Column("A", spare=5), lambda joint: _number(joint.current_peak, ".2f")),
-    (Column("%"), _share("current")),
-    (Column("net J", spare=3), lambda joint: _number(joint.energy_net_j, ".3f")),
-    (Column("abs J", spare=2), lambda joint: _number(joint.energy_abs_j, ".3f")),
-    (Column("el. J", spare=3), lambda joint: _number(joint.energy_el_j, ".3f")),
-    (Column("clamped", spare=3), lambda joint: _number(joint.clamped or math.nan, ".0%")),
+_COLUMNS: tuple[tuple[TerminalColumn, Callable[[JointDemand], str]], ...] = (
+    (TerminalColumn("joint", left=True), lambda joint: joint.name),
+    (TerminalColumn("from °", spare=4), lambda joint: _degrees(joint.least)),
+    (TerminalColumn("to °", spare=4), lambda joint: _degrees(joint.greatest)),
+    (TerminalColumn("%"), _share("range")),
+    (TerminalColumn("°/s", spare=5), lambda joint: _degrees(joint.rate, ".0f")),
+    (TerminalColumn("%"), _share("rate")),
+    (TerminalColumn("°/s²", spare=1), lambda joint: _degrees(joint.acceleration, ".0f")),
+    (TerminalColumn("error °", spare=5), lambda joint: _degrees(joint.tracking_error)),
+    (TerminalColumn("%"), _share("tracking error")),
+    (TerminalColumn("N m", spare=5), lambda joint: _number(joint.torque_peak, ".3f")),
+    (TerminalColumn("%"), _share("torque")),
+    (TerminalColumn("rms", spare=2), lambda joint: _number(joint.torque_rms, ".3f")),
+    (TerminalColumn("A", spare=5), lambda joint: _number(joint.current_peak, ".2f")),
+    (TerminalColumn("%"), _share("current")),
+    (TerminalColumn("net J", spare=3), lambda joint: _number(joint.energy_net_j, ".3f")),
+    (TerminalColumn("abs J", spare=2), lambda joint: _number(joint.energy_abs_j, ".3f")),
+    (TerminalColumn("el. J", spare=3), lambda joint: _number(joint.energy_el_j, ".3f")),
+    (TerminalColumn("clamped", spare=3), lambda joint: _number(joint.clamped or math.nan, ".0%")),
 )
 
 
@@ -342,19 +342,19 @@ def _answer(run: DryRun) -> Iterator[str]:
     robot, near = run.scenario.robot.name, _nearest(run)
     what = f"{run.driven.name} on {robot}"
     match run.verdict:
-        case Verdict.RUNS:
+        case DryRunVerdict.RUNS:
             yield f"{what} would run as it is; {near}"
-        case Verdict.CLAMPED:
+        case DryRunVerdict.CLAMPED:
             yield f"{what} would run, clamped: {_clamps(run)}; {near}"
-        case Verdict.STOPS:
+        case DryRunVerdict.STOPS:
             when = f"at {run.duration_s:.2f} s" if run.started else "on the way to the first pose"
             yield f"{what} would stop {when}: {run.fault.text if run.fault is not None else ''}"
-        case Verdict.UNFINISHED:
+        case DryRunVerdict.UNFINISHED:
             yield (
                 f"{what}: not known, the dry run was stopped at {run.duration_s:g} s of "
                 f"{run.scenario.duration_s:g} s; {near}"
             )
-        case Verdict.REFUSED:
+        case DryRunVerdict.REFUSED:
             lacks = f"{robot} lacks the limits {', '.join(run.missing)}"
             yield f"{what} would not start: {lacks}; {near}"
             yield "Its description needs this, with values of its own; --robot names the file:"

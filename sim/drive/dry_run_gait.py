@@ -22,7 +22,7 @@ from ..physics.sensing import JointSample, SensorSample
 from ..twin.twin import Sample, Twin
 from .gate import Gate
 from .limits import GateLimits
-from .outcome import GateEvent, GateInput, JointStatus, Phase
+from .outcome import GateEvent, GateInput, GatePhase, JointStatus
 
 _ENERGIES = tuple(
     JOINT_TERMS.index(term) for term in ("mechanical_net", "mechanical_abs", "electrical_net")
@@ -280,7 +280,7 @@ class GatedGait:
         self._current = self._unknown
         self._values: FloatArray = np.full(len(gait.names), np.nan)
         self._tick = 0
-        self._phase = Phase.POSE
+        self._phase = GatePhase.POSE
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - ticks count
         """Ask the gate."""
@@ -300,7 +300,7 @@ class GatedGait:
         self._tick += 1
         self.remarks += step.remarks
         self._phase = step.phase
-        if was is Phase.RUN:
+        if was is GatePhase.RUN:
             self.tally.measured(readings.angle - before)
             self.tally.receive(self.twin.sensed)
         if step.command is not None:
@@ -317,7 +317,7 @@ class GatedGait:
         Args:
             sample: What the twin made of the last step.
         """
-        if self._phase is Phase.RUN:
+        if self._phase is GatePhase.RUN:
             self.tally.energy(sample.joint_energy)
 
     def fresh_remarks(self) -> Iterator[GateEvent]:

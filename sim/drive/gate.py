@@ -26,7 +26,7 @@ from undulog.capture.robot.model import OnFault
 
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick
 from .feedback import CurrentLimiter, Silence, Watch
-from .limits import Clamp, Clamped, Ending, GateLimits, Ramp, why_not_from
+from .limits import Clamp, Clamped, EndingRamp, GateLimits, Ramp, why_not_from
 from .outcome import (
     MUTE,
     DriveEnding,
@@ -34,10 +34,10 @@ from .outcome import (
     GateEvent,
     GateFault,
     GateInput,
+    GatePhase,
     GateStep,
     JointStatus,
     Outcome,
-    Phase,
 )
 
 POSE_S = 2.0
@@ -79,7 +79,7 @@ class Gate:
                 it is and to measure its reply interval [s]; 0: it is the robot's, which waits for
                 each command, so that no command can be held up.
         """
-        self.phase = Phase.POSE
+        self.phase = GatePhase.POSE
         self.outcome: Outcome | None = None
         self.gait_error: Exception | None = None
         self.run_from: int | None = None
@@ -95,7 +95,7 @@ class Gate:
         self._watch, self._yielding = Watch(limits), CurrentLimiter(limits.current)
         self._first: GaitTick | None = None
         self._clamp: Clamp | None = None
-        self._way: Ramp | Ending | None = None
+        self._way: Ramp | EndingRamp | None = None
         self._progress_s = 0.0
         self._tick: int | None = None  # the last one in which something was sent
         self._reported: GateFault | None = None
@@ -105,7 +105,7 @@ class Gate:
     @property
     def done(self) -> bool:
         """Whether nothing is sent any more."""
-        return self.phase is Phase.DONE
+        return self.phase is GatePhase.DONE
 
     @property
     def cuts(self) -> dict[str, int]:
@@ -133,14 +133,14 @@ class Gate:
         if self.done:
             return self._quiet()
         if not tick:
-            self._remark("info", f"gate: {Phase.POSE}")
+            self._remark("info", f"gate: {GatePhase.POSE}")
         self.silence.tick(tick, received=inputs.received, expected=inputs.expected)
         clamp = self._clamp or self._begin(tick, inputs, stop)
         if clamp is None:
             return self._quiet()
         self._log_skipped(tick, inputs.late_s)
         self._follow(tick, inputs, clamp, stop, at_once=at_once)
-        if self.phase in {Phase.DONE, Phase.HOLD}:
+        if self.phase in {GatePhase.DONE, GatePhase.HOLD}:
             return self._quiet()
         wanted, gait = self._wanted(tick, inputs, clamp)
         pulled = self._yielding.apply(wanted, inputs.status.angle, inputs.status.current)
@@ -160,7 +160,7 @@ class Gate:
             self.outcome = Outcome(
                 DriveEnding.FAULT, why, "nothing more was sent", GateFault(FaultKind.BUS, why)
             )
-        self.phase = Phase.DONE
+        self.phase = GatePhase.DONE
 
     # -- reading the pose ------------------------------------------------------------------
 
@@ -171,7 +171,7 @@ class Gate:
             raise SourceError(self._place, f"no command was sent: {trouble.text}")
         if stop:
             self.outcome = Outcome(DriveEnding.STOPPED, stop, "no command was sent")
-            self.phase = Phase.DONE
+            self.phase = GatePhase.DONE
             return None
         if waited_s < self._listen_s:
             return None
@@ -197,7 +197,7 @@ class Gate:
         self._way, self._progress_s = Ramp(clamp.last, target, limits.ramp_rate), 0.0
         joint = int(np.argmax(far))
         self._become(
-            Phase.APPROACH,
+            GatePhase.APPROACH,
             f"{self._way.duration_s:.2g} s to the first pose, {limits.joint_names[joint]} has the "
             f"longest way, from {clamp.last[joint]:.3f} to {target[joint]:.3f} rad",
         )
@@ -209,9 +209,9 @@ class Gate:
         self, tick: int, inputs: GateInput, clamp: Clamp
     ) -> tuple[FloatArray, GaitTick | None]:
         """Return the requested command of the phase, before limits."""
-        if self.phase is not Phase.RUN and self._way is not None:
+        if self.phase is not GatePhase.RUN and self._way is not None:
             self._progress_s += _PERIOD_S  # also where it is late: no jump
-            if self.phase is Phase.ENDING or self._progress_s < self._way.duration_s:
+            if self.phase is GatePhase.ENDING or self._progress_s < self._way.duration_s:
                 return self._way.at(self._progress_s), None
             self._run(tick)
         self.run_s = min(tick - (self.run_from or 0), self._last) / CONTROL_RATE_HZ
@@ -228,17 +228,21 @@ class Gate:
 
     def _end_in_time(self) -> None:
         """End the drive if the last command was the final one."""
-        if self.phase is Phase.RUN and self.run_s * CONTROL_RATE_HZ >= self._last - 1e-6:
+        if self.phase is GatePhase.RUN and self.run_s * CONTROL_RATE_HZ >= self._last - 1e-6:
             self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
-            self._become(Phase.DONE)
+            self._become(GatePhase.DONE)
             return
         way = self._way
-        if self.phase is Phase.ENDING and way is not None and self._progress_s >= way.duration_s:
-            self._become(Phase.DONE)
+        if (
+            self.phase is GatePhase.ENDING
+            and way is not None
+            and self._progress_s >= way.duration_s
+        ):
+            self._become(GatePhase.DONE)
 
     def _run(self, tick: int) -> None:
         self.run_from = tick
-        self._become(Phase.RUN)
+        self._become(GatePhase.RUN)
 
     # -- what goes wrong -------------------------------------------------------------------
 
@@ -247,10 +251,10 @@ class Gate:
     ) -> None:
         """Change the phase on a fault or a stop request."""
         found = self._trouble(tick, inputs, clamp)
-        if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
+        if self.phase is GatePhase.HOLD and (found is None or found.kind not in MUTE):
             self._go_on_holding(clamp, inputs.status, at_once=at_once)
             return
-        ending = self.phase is Phase.ENDING or self.silence.silent
+        ending = self.phase is GatePhase.ENDING or self.silence.silent
         if found is not None and (not ending or found.kind in MUTE):
             self._fail(found, clamp, inputs.status)
             return
@@ -262,7 +266,7 @@ class Gate:
             self._remark("error", f"fault while ending: {found.text}")
         if at_once:
             self._halt(f"{stop}, twice")
-        elif stop and self.phase is not Phase.ENDING:
+        elif stop and self.phase is not GatePhase.ENDING:
             self.outcome = Outcome(DriveEnding.STOPPED, stop, "")
             self._end(clamp, inputs.status)
 
@@ -285,7 +289,7 @@ class Gate:
         elif fault.kind is FaultKind.SILENT:
             self.held_ticks, self._silent_ticks = self.held_ticks + 1, self.silence.ticks
             self._was_received = False
-            self._become(Phase.HOLD, "nothing is sent until a joint is received")
+            self._become(GatePhase.HOLD, "nothing is sent until a joint is received")
         else:
             self._end(clamp, status)
 
@@ -323,7 +327,7 @@ class Gate:
 
     def _end(self, clamp: Clamp, status: JointStatus) -> None:
         """Begin the ending that the robot's file names."""
-        ending = Ending(self._limits, clamp.last, status)
+        ending = EndingRamp(self._limits, clamp.last, status)
         self._way, self._progress_s = ending, 0.0
         if self._limits.on_fault is OnFault.HOLD:
             how = "the joints were held where they were"
@@ -333,7 +337,7 @@ class Gate:
             how = f"the servos held for {self.held_ticks / CONTROL_RATE_HZ:.2g} s, then {how}"
         if self.outcome is not None:
             self.outcome = dataclasses.replace(self.outcome, ended=how)
-            self._become(Phase.ENDING, f"{self.outcome.why}; {self._limits.on_fault}")
+            self._become(GatePhase.ENDING, f"{self.outcome.why}; {self._limits.on_fault}")
 
     def _halt(self, why: str) -> None:
         """Send nothing from here on."""
@@ -342,7 +346,7 @@ class Gate:
             self.outcome = dataclasses.replace(self.outcome, ended=ended)
         else:
             self.outcome = Outcome(DriveEnding.STOPPED, why, ended)
-        self._become(Phase.DONE, "nothing is sent any more")
+        self._become(GatePhase.DONE, "nothing is sent any more")
 
     # -- telling ---------------------------------------------------------------------------
 
@@ -352,10 +356,12 @@ class Gate:
         left_out = 0 if before is None else tick - before - 1
         if left_out > 0:
             many = f"{left_out} control ticks were" if left_out > 1 else "a control tick was"
-            of_gait = f", {left_out / CONTROL_RATE_HZ:g} s of the gait" * (self.phase is Phase.RUN)
+            of_gait = f", {left_out / CONTROL_RATE_HZ:g} s of the gait" * (
+                self.phase is GatePhase.RUN
+            )
             self._remark("warn", f"gate: {late_s:.3f} s late, {many} left out{of_gait}")
 
-    def _become(self, phase: Phase, detail: str = "") -> None:
+    def _become(self, phase: GatePhase, detail: str = "") -> None:
         self.phase = phase
         self._remark("info", f"gate: {phase}" + (f", {detail}" if detail else ""))
 

@@ -14,7 +14,7 @@ from undulog.capture.robot.model import Plane, Robot
 from ..gait.contract import Gait, GaitTick, Readings
 from ..gait.wave import smoothstep
 from ..scenario.scenario import Scenario
-from ..twin.recording import Driver, Recording, record
+from ..twin.recording import Driver, TwinRecording, record
 from ..twin.twin import Sample
 from .motion import MotionSource
 
@@ -85,7 +85,7 @@ def drive_twin(
     force: bool = False,
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
-) -> Recording:
+) -> TwinRecording:
     """Drive the twin and record it.
 
     A stop request lets the gait come to rest first (:class:`Fading`), then the run ends.

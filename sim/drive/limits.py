@@ -343,7 +343,7 @@ class Ramp:
         return self._start + smoothstep(time_s / self.duration_s) * self._way
 
 
-class Ending:
+class EndingRamp:
     """The commands of an ending; it ends by its own time, whatever the joints do.
 
     It starts from the present pose: a joint's last command where the joint is near it, else the

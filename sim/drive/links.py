@@ -189,7 +189,7 @@ def _with_gait_signals(robot: Robot) -> Robot:
     return dataclasses.replace(robot, bus=dataclasses.replace(robot.bus, signals=signals))
 
 
-class Link(Protocol):
+class BusLink(Protocol):
     """A bus."""
 
     @property

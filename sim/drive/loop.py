@@ -23,8 +23,8 @@ from ..gait.contract import CONTROL_RATE_HZ
 from .feedback import BusCheck, Confirmation
 from .gate import Gate
 from .limits import Spacing
-from .links import BusReadings, Link, VirtualRobotLink
-from .outcome import FaultKind, GateFault, GateInput, GateStep, Phase
+from .links import BusLink, BusReadings, VirtualRobotLink
+from .outcome import FaultKind, GateFault, GateInput, GatePhase, GateStep
 
 _STREAMS = (0, 1, 2)
 
@@ -72,7 +72,7 @@ class WallPace:
     by_the_clock = True
     """Whether the clock sets the pace, rather than the robot."""
 
-    def __init__(self, link: Link, clock: Clock = REAL) -> None:
+    def __init__(self, link: BusLink, clock: Clock = REAL) -> None:
         """The first tick is at once."""
         self._clock = clock
         self.overruns = 0
@@ -227,7 +227,7 @@ class ControlLoop:
         self,
         gate: Gate,
         robot: Robot,
-        link: Link,
+        link: BusLink,
         pace: WallPace | LockstepPace,
         *,
         spacing: Spacing | None,
@@ -282,7 +282,7 @@ class ControlLoop:
         """
         gone = False
         unwritten: UndulogError | None = None
-        while self._gate.phase is not Phase.DONE:
+        while self._gate.phase is not GatePhase.DONE:
             try:
                 tick, received = self._pace.next()
                 inputs = self._receive(tick, received)
@@ -339,7 +339,7 @@ class ControlLoop:
 
         The requests follow the commands, so that a reply confirms these.
         """
-        if self._gate.phase is Phase.DONE and step.command is None:
+        if self._gate.phase is GatePhase.DONE and step.command is None:
             return empty_frames(0)
         frames, earliest_ns = empty_frames(0), None
         if step.command is not None:

@@ -171,7 +171,7 @@ class JointStatus:
     silence_s: FloatArray
 
 
-class Phase(StrEnum):
+class GatePhase(StrEnum):
     """State of the gate."""
 
     POSE = "reading the pose"
@@ -223,7 +223,7 @@ class GateStep(NamedTuple):
         remarks: Events to be logged.
     """
 
-    phase: Phase
+    phase: GatePhase
     command: FloatArray | None
     wanted: FloatArray | None
     gait: GaitTick | None

@@ -23,7 +23,7 @@ from ..twin.recording import quick_collections
 from .feedback import Confirmation
 from .gate import Gate
 from .limits import Spacing, gate_limits
-from .links import Link, VirtualRobotLink
+from .links import BusLink, VirtualRobotLink
 from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
 from .motion import MotionSource
 from .outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
@@ -217,7 +217,7 @@ def _urgent(session: BusSession, *, lockstep: bool) -> Generator[None]:
         yield
 
 
-def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:
+def _virtual(link: BusLink, plan: BusPlan) -> VirtualRobotLink | None:
     """Return the link if it is that of a virtual robot, else None."""
     if not isinstance(link, VirtualRobotLink):
         return None

@@ -53,9 +53,9 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture.common.config import Name, NonNegative, read_field
-from undulog.capture.common.errors import Fault, PlanError
+from undulog.capture.common.errors import DescriptionFault, PlanError
 from undulog.capture.common.files import is_file
-from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed
+from undulog.capture.common.strict_table import NAME_PATTERN, Faults, StrictTable, listed
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.model import Plane, Robot
 
@@ -67,7 +67,7 @@ from ..scenario.scenario_file import load_scenario, scenario_names
 
 
 @dataclass(frozen=True)
-class Segment:
+class PlanSegment:
     """One part of a plan.
 
     Attributes:
@@ -98,7 +98,7 @@ class Plan:
     scenario: Scenario
     start: Mapping[Plane, PlaneGait]
     ramp_s: float
-    segments: tuple[Segment, ...]
+    segments: tuple[PlanSegment, ...]
 
     @property
     def duration_s(self) -> float:
@@ -190,9 +190,9 @@ def parse_plan(text: str, source: Path) -> Plan:
     try:
         values = read_toml(text)
     except ValueError as error:
-        raise PlanError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
+        raise PlanError(source, [DescriptionFault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
-    top = Table(values, "", faults)
+    top = StrictTable(values, "", faults)
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "plan"
     name: str = read_field(top, Plan, "name", stem)
     description: str = read_field(top, Plan, "description")
@@ -205,7 +205,7 @@ def parse_plan(text: str, source: Path) -> Plan:
     return Plan(name, description, scenario, start, ramp_s, segments)
 
 
-def _scenario(top: Table, folder: Path) -> Scenario | None:
+def _scenario(top: StrictTable, folder: Path) -> Scenario | None:
     """The plan's scenario; None after a fault."""
     name = top.text("scenario")
     if name in scenario_names():
@@ -218,7 +218,7 @@ def _scenario(top: Table, folder: Path) -> Scenario | None:
     return None
 
 
-def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait], float]:
+def _start(top: StrictTable, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait], float]:
     """Return the gait of each plane at time zero, and the ramp [s]."""
     robot = scenario.robot if scenario is not None else None
     given = "gait" in top
@@ -234,8 +234,8 @@ def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait
     return dict(gait.planes), gait.ramp_s
 
 
-def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ...]:
-    segments: list[Segment] = []
+def _segments(top: StrictTable, start: Mapping[Plane, PlaneGait]) -> tuple[PlanSegment, ...]:
+    segments: list[PlanSegment] = []
     for table in top.tables("segments"):
         segments.append(_segment(table, segments[-1].planes if segments else start))
         table.close()
@@ -246,10 +246,10 @@ def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ..
     return tuple(segments)
 
 
-def _segment(table: Table, before: Mapping[Plane, PlaneGait]) -> Segment:
-    duration_s: float = read_field(table, Segment, "duration_s")
-    shorter = min(Segment.transition_s, duration_s)
-    transition_s: float = read_field(table, Segment, "transition_s", shorter)
+def _segment(table: StrictTable, before: Mapping[Plane, PlaneGait]) -> PlanSegment:
+    duration_s: float = read_field(table, PlanSegment, "duration_s")
+    shorter = min(PlanSegment.transition_s, duration_s)
+    transition_s: float = read_field(table, PlanSegment, "transition_s", shorter)
     if transition_s > duration_s:
         table.fault("transition_s", f"at most the segment's duration_s = {duration_s:g}")
     planes = dict(before)
@@ -263,13 +263,13 @@ def _segment(table: Table, before: Mapping[Plane, PlaneGait]) -> Segment:
         part = table.table(plane)
         planes[plane] = _changed(part, before[plane])
         part.close()
-    mode: str = read_field(table, Segment, "mode")
+    mode: str = read_field(table, PlanSegment, "mode")
     if not mode.strip():
         table.fault("mode", "a word, e.g. walk")
-    return Segment(duration_s, planes, transition_s, mode)
+    return PlanSegment(duration_s, planes, transition_s, mode)
 
 
-def _changed(part: Table, before: PlaneGait) -> PlaneGait:
+def _changed(part: StrictTable, before: PlaneGait) -> PlaneGait:
     """A plane's values after a change."""
     names = ("amplitude", "frequency_hz", "lag", "offset", "wave")
     after = {name: read_field(part, PlaneGait, name, getattr(before, name)) for name in names}

@@ -59,7 +59,7 @@ _SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
 @dataclass(frozen=True)
-class Coupling:
+class NeighbourCoupling:
     """What neighbours do to each other.
 
     Attributes:
@@ -81,7 +81,7 @@ class Coupling:
         return 2.0 * float(pull.max())
 
 
-def phase_rates(theta: FloatArray, coupling: Coupling) -> FloatArray:
+def phase_rates(theta: FloatArray, coupling: NeighbourCoupling) -> FloatArray:
     """phi_i' = sum_j K_ij sin(phi_j - phi_i - psi_ij), psi_ij = (j - i) psi, |j - i| = 1.
 
     Args:
@@ -99,7 +99,7 @@ def phase_rates(theta: FloatArray, coupling: Coupling) -> FloatArray:
     return rate
 
 
-def hopf_rates(z: ComplexArray, coupling: Coupling, attraction: float) -> ComplexArray:
+def hopf_rates(z: ComplexArray, coupling: NeighbourCoupling, attraction: float) -> ComplexArray:
     """z_i' = alpha (mu - |z_i|^2) z_i + sum_j K_ij (z_j exp(-i psi_ij) - z_i), mu = 1.
 
     With z = x + i y and i omega z, which the turning frame leaves out, the first part is the Hopf
@@ -155,7 +155,7 @@ class PhaseOscillators:
         radius: Radii in units of the limit cycle's, shape (n,).
     """
 
-    def __init__(self, theta: FloatArray, coupling: Coupling) -> None:
+    def __init__(self, theta: FloatArray, coupling: NeighbourCoupling) -> None:
         """Start at given phases.
 
         Args:
@@ -187,7 +187,7 @@ class PhaseOscillators:
 class HopfOscillators:
     """Hopf oscillators, :func:`hopf_rates`, with the extra rates turning each one's phase."""
 
-    def __init__(self, theta: FloatArray, coupling: Coupling, attraction: float) -> None:
+    def __init__(self, theta: FloatArray, coupling: NeighbourCoupling, attraction: float) -> None:
         """Start on the limit cycle at given phases.
 
         Args:
@@ -352,7 +352,7 @@ class _OscillatorRhythm:
         self._phase = IntegratedPhase(chain.phase, self._omega)
         self._bias = np.broadcast_to(chain.feedback_bias, n)
         self._detuning = np.broadcast_to(chain.detuning, n)
-        coupling = Coupling(
+        coupling = NeighbourCoupling(
             np.broadcast_to(chain.forward, n - 1),
             np.broadcast_to(chain.backward, n - 1),
             chain.signed_lag,

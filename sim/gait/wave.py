@@ -93,7 +93,7 @@ class WaveState(NamedTuple):
     lag: float
 
 
-class Rhythm(Protocol):
+class PhaseGenerator(Protocol):
     """One plane's generator of phases, amplitudes and offsets."""
 
     def step(self, time_s: float, change: Modulation, readings: Readings) -> WaveState:
@@ -186,7 +186,7 @@ class _PlanePart:
     """One driven plane of the robot: its joints, their limits, and what sets their rhythm."""
 
     plane: Plane
-    rhythm: Rhythm
+    rhythm: PhaseGenerator
     joints: IntArray
     names: tuple[str, ...]
     lower: FloatArray
@@ -215,7 +215,7 @@ class WaveGenerator:
     """
 
     def __init__(
-        self, rhythms: Mapping[Plane, Rhythm], robot: Robot, *, per_joint: bool = False
+        self, rhythms: Mapping[Plane, PhaseGenerator], robot: Robot, *, per_joint: bool = False
     ) -> None:
         """Put the planes together.
 

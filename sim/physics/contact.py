@@ -210,7 +210,7 @@ class Contact(NamedTuple):
     force: FloatArray
 
 
-class GroundContact:
+class GroundLaw:
     """The ground's law, bound to the arrays where one body's state and contact stand.
 
     Short arrays cost by the call, not by the element. So components are views that are made once,

@@ -20,7 +20,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
 from ..scenario.world import Ground
-from .contact import Contact, GroundContact
+from .contact import Contact, GroundLaw
 from .engine import BodyState
 from .obstacle_contact import NO_CONTACT, ObstacleContact
 from .servo import Drive, Rotors, Servos
@@ -198,9 +198,7 @@ class NumpyLaws:
         """
         radius = np.array([link.radius for link in robot.links])
         self._rows = tuple(steps)
-        self._ground = tuple(
-            GroundContact(ground, radius, row.body, row.contact) for row in self._rows
-        )
+        self._ground = tuple(GroundLaw(ground, radius, row.body, row.contact) for row in self._rows)
         self._servos, self._dt = servos, dt
         self._reference = np.zeros(steps.joint_count)
 

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from undulog.capture.common.config import NonNegative, Positive, read_field
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.strict_table import Table, above, at_most, listed
+from undulog.capture.common.strict_table import StrictTable, above, at_most, listed
 from undulog.capture.robot.model import Robot
 
 _SLACK_S = 1e-9  # ticks and sums of decimal fractions differ in the last bit
@@ -35,7 +35,7 @@ FORM = "KIND[:JOINT][:NUMBER][@FROM[+FOR]], e.g. lost:joint07:0.1 or bus-off@5+2
 """Form of a fault on the command line, for messages."""
 
 
-class FaultKind(StrEnum):
+class BusFaultKind(StrEnum):
     """Kind of a fault."""
 
     LOST = "lost"
@@ -60,13 +60,13 @@ class _Grammar(NamedTuple):
 
 
 _GRAMMAR = {
-    FaultKind.LOST: _Grammar(None, ("a probability", 1.0)),
-    FaultKind.STUCK: _Grammar(True, None),
-    FaultKind.FROZEN: _Grammar(True, None),
-    FaultKind.OVER_CURRENT: _Grammar(True, ("a current in A", 100.0)),
-    FaultKind.BUS_OFF: _Grammar(False, None),
-    FaultKind.NOISE: _Grammar(False, ("a probability", 0.9)),  # frames are repeated until heard
-    FaultKind.DELAY: _Grammar(False, ("a time in s", 10.0)),
+    BusFaultKind.LOST: _Grammar(None, ("a probability", 1.0)),
+    BusFaultKind.STUCK: _Grammar(True, None),
+    BusFaultKind.FROZEN: _Grammar(True, None),
+    BusFaultKind.OVER_CURRENT: _Grammar(True, ("a current in A", 100.0)),
+    BusFaultKind.BUS_OFF: _Grammar(False, None),
+    BusFaultKind.NOISE: _Grammar(False, ("a probability", 0.9)),  # frames are repeated until heard
+    BusFaultKind.DELAY: _Grammar(False, ("a time in s", 10.0)),
 }
 
 
@@ -81,7 +81,7 @@ class BusFault:
         for_s: How long it lasts [s].
     """
 
-    kind: FaultKind
+    kind: BusFaultKind
     joint: str = ""
     value: float = 0.0
     from_s: NonNegative = 0.0
@@ -107,7 +107,7 @@ class BusFault:
         return {"kind": str(self.kind), **known}
 
 
-def read_faults(top: Table, robot: Robot | None) -> tuple[BusFault, ...]:
+def read_faults(top: StrictTable, robot: Robot | None) -> tuple[BusFault, ...]:
     """Read ``[[faults]]`` of a scenario.
 
     Args:
@@ -119,14 +119,14 @@ def read_faults(top: Table, robot: Robot | None) -> tuple[BusFault, ...]:
     """
     faults: list[BusFault] = []
     for table in top.tables("faults"):
-        kind = table.choice("kind", FaultKind)
+        kind = table.choice("kind", BusFaultKind)
         if kind is not None:
             faults.append(_read(table, kind, robot))
         table.close()
     return tuple(faults)
 
 
-def _read(table: Table, kind: FaultKind, robot: Robot | None) -> BusFault:
+def _read(table: StrictTable, kind: BusFaultKind, robot: Robot | None) -> BusFault:
     grammar, joint, value = _GRAMMAR[kind], "", 0.0
     if grammar.joint is False:
         if "joint" in table:
@@ -168,9 +168,9 @@ def _parsed(text: str, robot: Robot) -> BusFault:
     if match is None:
         raise UsageError(f"{text!r} is no fault: expected {FORM}")
     word, *rest = match["what"].split(":")
-    if word not in list(FaultKind):
-        raise UsageError(f"{text!r}: no fault {word!r}; valid: {listed(FaultKind, word)}")
-    kind = FaultKind(word)
+    if word not in list(BusFaultKind):
+        raise UsageError(f"{text!r}: no fault {word!r}; valid: {listed(BusFaultKind, word)}")
+    kind = BusFaultKind(word)
     grammar, joint, value = _GRAMMAR[kind], "", 0.0
     if grammar.joint or (grammar.joint is None and len(rest) > 1):
         joint = rest.pop(0) if rest else ""

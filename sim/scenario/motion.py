@@ -20,7 +20,7 @@ from undulog.capture.common.config import (
     read_fields,
     write,
 )
-from undulog.capture.common.strict_table import Table, at_least, at_most
+from undulog.capture.common.strict_table import StrictTable, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot, SensorKind
 
 from ..gait.contract import Generator
@@ -33,7 +33,7 @@ from ..gait.oscillators import (
     OscillatorKind,
 )
 from ..gait.wave import PlaneGait, Serpentine, SerpentineGait
-from .sensors import Layout, layout
+from .sensors import SensorLayout, layout
 
 GaitParameters: TypeAlias = Serpentine | DelayBlocks | OscillatorChains
 """Gait parameters of a scenario."""
@@ -69,7 +69,7 @@ _KINDS: dict[GaitKind, tuple[type[GaitParameters], type[PlaneParameters]]] = {
 }
 
 
-def read_gait(table: Table, robot: Robot | None) -> GaitParameters:
+def read_gait(table: StrictTable, robot: Robot | None) -> GaitParameters:
     """Read the gait; faults are noted in the table.
 
     Args:
@@ -107,7 +107,7 @@ def gait_table(parameters: GaitParameters) -> dict[str, Any]:
 
 
 def _planes(
-    table: Table, robot: Robot | None, part: type[PlaneParameters]
+    table: StrictTable, robot: Robot | None, part: type[PlaneParameters]
 ) -> dict[Plane, PlaneParameters]:
     planes: dict[Plane, PlaneParameters] = {}
     for plane in Plane:
@@ -125,7 +125,7 @@ def _planes(
     return planes
 
 
-def _oscillator_chain(part: Table, count: int | None) -> OscillatorChain:
+def _oscillator_chain(part: StrictTable, count: int | None) -> OscillatorChain:
     def numbers(name: str, number: int | None) -> Callable[[], Numbers]:
         return lambda: _numbers(part, declared(OscillatorChain)[name], number)
 
@@ -145,7 +145,7 @@ def _oscillator_chain(part: Table, count: int | None) -> OscillatorChain:
     return chain
 
 
-def _numbers(part: Table, one: Declared, count: int | None) -> Numbers:
+def _numbers(part: StrictTable, one: Declared, count: int | None) -> Numbers:
     """One number, or an array of ``count``."""
     value = part.look(one.key)[1]
     if not isinstance(value, list):
@@ -155,7 +155,7 @@ def _numbers(part: Table, one: Declared, count: int | None) -> Numbers:
         part.fault(one.key, f"a number, or an array of {count}", f"an array of {len(entries)}")
         return one.default
     each = {f"{part.key(one.key)}[{i}]": entry for i, entry in enumerate(entries)}
-    listed = Table(each, "", part.faults)
+    listed = StrictTable(each, "", part.faults)
     return tuple(listed.number(name, *one.bounds) for name in each)
 
 
@@ -327,7 +327,7 @@ _PARTS: dict[ControllerKind, dict[str, type[Any]]] = {
 
 
 def read_controller(
-    table: Table, robot: Robot | None, *, horizontal: bool, target: bool
+    table: StrictTable, robot: Robot | None, *, horizontal: bool, target: bool
 ) -> Controller | None:
     """Read ``[controller]``; faults are noted in the table.
 
@@ -362,7 +362,7 @@ def read_controller(
     )
 
 
-def _check(table: Table, kind: ControllerKind, robot: Robot, roles: Layout) -> None:
+def _check(table: StrictTable, kind: ControllerKind, robot: Robot, roles: SensorLayout) -> None:
     """Whether the robot has the sensors."""
     missing: list[str] = []
     if not roles.head:

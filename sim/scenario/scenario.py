@@ -23,14 +23,14 @@ import tomlkit
 
 from undulog.capture.common.config import Name, NonNegative, read_field, write
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.strict_table import Table, above, at_least, at_most
+from undulog.capture.common.strict_table import StrictTable, above, at_least, at_most
 from undulog.capture.robot.model import Robot, Servo
 
 from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import BusFault
 from .motion import Controller, GaitParameters, gait_table
 from .obstacles import Seed
-from .sensors import Noise, SensorModels
+from .sensors import SensorModels, SensorNoise
 from .world import Push, World, body_length, world_table
 
 MASS_FACTOR = "mass_factor"
@@ -125,7 +125,7 @@ class Modules:
         return {name: table for name, table in write(self).items() if table}
 
 
-def read_modules(top: Table, robot: Robot | None) -> Modules:
+def read_modules(top: StrictTable, robot: Robot | None) -> Modules:
     """Read ``[servo]``, ``[servo_of.JOINT]`` and ``[link_of.LINK]`` of a scenario.
 
     Args:
@@ -148,7 +148,7 @@ def read_modules(top: Table, robot: Robot | None) -> Modules:
     return modules
 
 
-def _check_rest(top: Table, robot: Robot) -> None:
+def _check_rest(top: StrictTable, robot: Robot) -> None:
     """A rotor at rest withstands no less than a moving one: add a fault where it would."""
     for joint in robot.joints:
         servo = joint.servo
@@ -161,7 +161,7 @@ def _check_rest(top: Table, robot: Robot) -> None:
             return
 
 
-def _servo_fields(table: Table) -> dict[str, float]:
+def _servo_fields(table: StrictTable) -> dict[str, float]:
     """The servo parameters that a table gives."""
     names = [item.name for item in dataclasses.fields(Servo) if item.name in table]
     given = {name: read_field(table, Servo, name) for name in names}
@@ -169,7 +169,7 @@ def _servo_fields(table: Table) -> dict[str, float]:
     return given
 
 
-def _link_fields(table: Table) -> dict[str, float]:
+def _link_fields(table: StrictTable) -> dict[str, float]:
     given = {MASS_FACTOR: table.number(MASS_FACTOR, above(0.0))} if MASS_FACTOR in table else {}
     table.close()
     return given
@@ -209,7 +209,7 @@ class Scenario:
     duration_s: Length
     settle_s: NonNegative = 0.0
     world: World = field(default_factory=World)
-    noise: Noise = field(default_factory=Noise)
+    noise: SensorNoise = field(default_factory=SensorNoise)
     sensing: SensorModels = field(default_factory=SensorModels)
     modules: Modules = field(default_factory=Modules)
     disturbances: tuple[Push, ...] = ()

@@ -93,9 +93,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from undulog.capture.common.config import read, read_field
-from undulog.capture.common.errors import Fault, ScenarioError, UsageError
+from undulog.capture.common.errors import DescriptionFault, ScenarioError, UsageError
 from undulog.capture.common.files import Description, Shelf, is_file
-from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed
+from undulog.capture.common.strict_table import NAME_PATTERN, Faults, StrictTable, listed
 from undulog.capture.common.untrusted_text import read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.capture.robot.model import Plane, Robot
@@ -104,7 +104,7 @@ from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import read_faults
 from .motion import read_controller, read_gait
 from .scenario import LONGEST_S, Scenario, read_modules
-from .sensors import Noise, read_sensing
+from .sensors import SensorNoise, read_sensing
 from .world import read_pushes, read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
@@ -168,14 +168,14 @@ def parse_scenario(
     try:
         values = read_toml(text)
     except ValueError as error:
-        raise ScenarioError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
+        raise ScenarioError(source, [DescriptionFault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
     for key, value in (changes or {}).items():
         _change(values, key, value, faults)
     world = values.get("world")
     if "world.slope" in (changes or {}) and isinstance(world, dict):
         cast("dict[str, object]", world).pop("gravity", None)  # the slope replaces it
-    top = Table(values, "", faults)
+    top = StrictTable(values, "", faults)
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
     robot = robot or _robot(top, robot_name, source.parent)
@@ -186,7 +186,7 @@ def parse_scenario(
         "robot_name": robot_name,
         "gait": read_gait(top.table("gait"), robot),
         "world": read_world(top.table("world"), robot, seed),
-        "noise": read(top.table("noise"), Noise),
+        "noise": read(top.table("noise"), SensorNoise),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
         "disturbances": read_pushes(top, robot),
@@ -245,7 +245,7 @@ def _change(values: dict[str, Any], key: str, value: object, faults: Faults) -> 
         faults.add(key, "a part of what is no table", "a key of a table, e.g. servo.stall_torque")
 
 
-def _times(top: Table) -> dict[str, Any]:
+def _times(top: StrictTable) -> dict[str, Any]:
     names = ("duration_s", "settle_s", "physics_rate_hz", "epoch_s")
     times = {name: read_field(top, Scenario, name) for name in names}
     if times["settle_s"] > times["duration_s"]:
@@ -257,7 +257,7 @@ def _times(top: Table) -> dict[str, Any]:
     return times
 
 
-def _robot(top: Table, name: str, folder: Path) -> Robot | None:
+def _robot(top: StrictTable, name: str, folder: Path) -> Robot | None:
     """The robot: a shipped name, or a file beside the scenario; None after a fault."""
     if name in robot_names():
         return load_robot(name)

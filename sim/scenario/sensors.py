@@ -10,7 +10,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.config import Count, NonNegative, Positive, read, read_fields
-from undulog.capture.common.strict_table import Table, at_least, at_most
+from undulog.capture.common.strict_table import StrictTable, at_least, at_most
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
 _RANGING = (SensorKind.IR, SensorKind.SONAR)
@@ -30,7 +30,7 @@ class SideSensor:
 
 
 @dataclass(frozen=True)
-class Layout:
+class SensorLayout:
     """The roles of a robot's range sensors.
 
     Attributes:
@@ -46,7 +46,7 @@ class Layout:
     fold_m: dict[str, float]
 
 
-def layout(robot: Robot) -> Layout:
+def layout(robot: Robot) -> SensorLayout:
     """Sort a robot's range sensors by where they sit and look.
 
     Looking sideways, on any link: a side sensor. Else on the first link and looking forward: a
@@ -63,7 +63,7 @@ def layout(robot: Robot) -> Layout:
     others = [sensor for sensor in sensors if sensor not in sideways]
     first, last = robot.links[0].name, robot.links[-1].name
     head = [s.name for s in others if s.link == first and abs(bearings[s.name]) < math.pi / 2]
-    return Layout(
+    return SensorLayout(
         head=tuple(head),
         tail=tuple(s.name for s in others if s.link == last and s.name not in head),
         sides=tuple(
@@ -103,7 +103,7 @@ def _side(robot: Robot, sensors: list[Sensor]) -> list[SideSensor]:
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """White noise of what the servos report, as standard deviations.
 
     Attributes:
@@ -225,7 +225,7 @@ class SensorModels:
     enabled: bool = True
 
 
-def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorModels:
+def read_sensing(table: StrictTable, robot: Robot | None, period_s: float) -> SensorModels:
     """Read ``[sensing]``.
 
     Args:
@@ -238,7 +238,7 @@ def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorMo
     return read(table, SensorModels, servo=lambda: _servo(table.table("servo"), robot, period_s))
 
 
-def _servo(table: Table, robot: Robot | None, period_s: float) -> ServoPolling:
+def _servo(table: StrictTable, robot: Robot | None, period_s: float) -> ServoPolling:
     servo = read_fields(table, ServoPolling)
     if robot is not None and servo.slot_s * len(robot.joints) >= period_s:
         longest = f"{len(robot.joints)} joints' turns in a control period of {period_s:g} s"

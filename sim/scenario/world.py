@@ -21,7 +21,7 @@ from undulog.capture.common.config import (
     write,
 )
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.strict_table import Table, at_least, at_most, listed
+from undulog.capture.common.strict_table import StrictTable, at_least, at_most, listed
 from undulog.capture.robot.model import Robot
 
 from .obstacles import Box, Cylinder, Obstacle, ObstacleMaterial, RandomField, Target, Wall
@@ -115,7 +115,7 @@ def pushes_during(
     return forces
 
 
-def read_pushes(top: Table, robot: Robot | None) -> tuple[Push, ...]:
+def read_pushes(top: StrictTable, robot: Robot | None) -> tuple[Push, ...]:
     """Read ``[[disturbances]]`` of a scenario.
 
     Args:
@@ -124,7 +124,7 @@ def read_pushes(top: Table, robot: Robot | None) -> tuple[Push, ...]:
     return tuple(_read_push(table, robot) for table in top.tables("disturbances"))
 
 
-def _read_push(table: Table, robot: Robot | None) -> Push:
+def _read_push(table: StrictTable, robot: Robot | None) -> Push:
     push = read_fields(table, Push)
     names = [] if robot is None else [link.name for link in robot.links]
     if robot is not None and push.link and push.link not in names:
@@ -250,7 +250,7 @@ _KINDS: dict[_Shape, type[Obstacle]] = {
 }
 
 
-def read_world(table: Table, robot: Robot | None, seed: int) -> World:
+def read_world(table: StrictTable, robot: Robot | None, seed: int) -> World:
     """Read ``[world]``.
 
     Args:
@@ -304,7 +304,7 @@ def body_length(robot: Robot) -> float:
     return math.fsum(link.length for link in robot.links) - robot.links[0].length / 2
 
 
-def _gravity(table: Table) -> tuple[float, float, float]:
+def _gravity(table: StrictTable) -> tuple[float, float, float]:
     slope = table.number("slope", at_least(-math.pi / 2), at_most(math.pi / 2), default=0.0)
     heading = table.number("slope_heading", default=0.0)
     if "slope" not in table:
@@ -316,7 +316,7 @@ def _gravity(table: Table) -> tuple[float, float, float]:
     return tilted_gravity(slope, heading)
 
 
-def _obstacle(part: Table) -> Obstacle | None:
+def _obstacle(part: StrictTable) -> Obstacle | None:
     """One obstacle; None after a fault of its shape."""
     shape = part.choice("shape", _Shape)
     return None if shape is None else read(part, _KINDS[shape])

@@ -16,7 +16,7 @@ from undulog.capture.sources.events import BUS_OFF, RESTARTED
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..physics.sensing import JointSample, RangeSample, SensorSample
-from ..scenario.bus_faults import BusFault, FaultKind
+from ..scenario.bus_faults import BusFault, BusFaultKind
 
 _OF_JOINT = (
     Quantity.POSITION,
@@ -178,7 +178,7 @@ class FaultLine:
             replies: Encodes what its joints report.
             seed: Of the random losses and errors.
         """
-        self._of = {kind: [f for f in faults if f.kind is kind] for kind in FaultKind}
+        self._of = {kind: [f for f in faults if f.kind is kind] for kind in BusFaultKind}
         self._joint = {name: i for i, name in enumerate(robot.joint_names)}
         self._replies = replies
         self._random = np.random.default_rng([seed, STREAM])
@@ -198,7 +198,7 @@ class FaultLine:
         Returns:
             The same, but for a stuck servo the angle that it had when it got stuck.
         """
-        acting = [fault for fault in self._of[FaultKind.STUCK] if fault.acts(time_s)]
+        acting = [fault for fault in self._of[BusFaultKind.STUCK] if fault.acts(time_s)]
         if not acting:
             return command
         command = command.copy()
@@ -220,7 +220,7 @@ class FaultLine:
         """
         frozen, drawing = (
             [fault for fault in self._of[kind] if fault.acts(time_s)]
-            for kind in (FaultKind.FROZEN, FaultKind.OVER_CURRENT)
+            for kind in (BusFaultKind.FROZEN, BusFaultKind.OVER_CURRENT)
         )
         if not (frozen or drawing):
             return list(samples)
@@ -244,7 +244,7 @@ class FaultLine:
         Args:
             time_s: Time since the start [s].
         """
-        return not any(fault.acts(time_s) for fault in self._of[FaultKind.BUS_OFF])
+        return not any(fault.acts(time_s) for fault in self._of[BusFaultKind.BUS_OFF])
 
     def replies(self, frames: FrameArray, now_ns: int, time_s: float) -> FrameArray:
         """Apply the faults to the robot's frames.
@@ -261,10 +261,10 @@ class FaultLine:
         if self._off == self.is_receiving(time_s):
             self._off = not self._off
             parts.append(_error_frames(BUS_OFF if self._off else RESTARTED, now_ns, 1))
-        for fault in self._of[FaultKind.LOST]:
+        for fault in self._of[BusFaultKind.LOST]:
             if fault.acts(time_s) and len(frames):
                 frames = frames[~self._losses(fault, frames)]
-        waiting = sum(fault.value for fault in self._of[FaultKind.DELAY] if fault.acts(time_s))
+        waiting = sum(fault.value for fault in self._of[BusFaultKind.DELAY] if fault.acts(time_s))
         if waiting or self._late:
             self._late.append((now_ns + round(waiting * NS), frames))
             due = [late for due_ns, late in self._late if due_ns <= now_ns]
@@ -282,7 +282,7 @@ class FaultLine:
 
     def _noisy(self, frames: FrameArray, now_ns: int, time_s: float) -> FrameArray:
         """Frames, each after as many error frames as attempts to send it were hit."""
-        for fault in self._of[FaultKind.NOISE]:
+        for fault in self._of[BusFaultKind.NOISE]:
             if not fault.acts(time_s) or not len(frames):
                 continue
             hits = self._random.geometric(1.0 - fault.value, len(frames)) - 1

@@ -13,7 +13,7 @@ from undulog.capture.robot.model import Plane, Robot, SensorKind
 from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Readings
 from ..scenario.motion import Controller, RandomTurns, TargetHeading, generator
 from ..scenario.sensors import layout
-from .filters import BodyWave, DeadReckoning, LowPass, turned
+from .filters import DeadReckoning, LowPass, PassedWave, turned
 from .reactions import (
     AmplitudeReduction,
     ControlInput,
@@ -175,7 +175,7 @@ class AdaptiveGait:
         self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
         self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
         self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
-        self._wave: BodyWave | None = None
+        self._wave: PassedWave | None = None
         self._phase = self._time_s = 0.0
         self._mode = WALK
         self._mode_since_s = 0.0
@@ -184,7 +184,7 @@ class AdaptiveGait:
         """Change the generator by the readings, and step it."""
         if self._wave is None:  # the first tick tells phase and lag; from the next on it reacts
             tick = self._generator.step(time_s, readings)
-            self._wave = BodyWave(len(self._horizontal), float(tick.values[self._lag_at]))
+            self._wave = PassedWave(len(self._horizontal), float(tick.values[self._lag_at]))
             return self._reported_tick(tick, time_s)
         elapsed_s, phase = time_s - self._time_s, self._phase
         pose = self._reckoning.step(elapsed_s, phase, self._steering.offset, readings)

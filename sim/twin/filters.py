@@ -134,7 +134,7 @@ class PathHeading:
         return float((np.trapezoid(psi, at) - turned) / span)
 
 
-class BodyWave:
+class PassedWave:
     """What the head decided, passed down the body at the speed of the wave.
 
     Y_i(t) = Y(t - (i - 1) |lag| / omega), the delay taken in phase so that it holds when omega

@@ -23,7 +23,7 @@ from undulog.capture.robot.model import Plane, Robot
 from ..gait.contract import Readings
 from ..scenario.motion import HeadSteering, SideShrinking, TailHaste
 from ..scenario.motion import Lookout as Parameters
-from ..scenario.sensors import Layout, bearing
+from ..scenario.sensors import SensorLayout, bearing
 from .filters import LowPass, NearMemory, PhaseHistory, Pose, SideLatch, turned
 
 
@@ -102,7 +102,7 @@ class InTheWay(NamedTuple):
 class ObstacleMonitor:
     """Keeps echoes while the robot moves on."""
 
-    def __init__(self, parameters: Parameters, layout: Layout, robot: Robot) -> None:
+    def __init__(self, parameters: Parameters, layout: SensorLayout, robot: Robot) -> None:
         """Start with nothing seen.
 
         Args:
@@ -242,7 +242,7 @@ class Steering:
 class AmplitudeReduction:
     """The amplitude of the joints beside a wall."""
 
-    def __init__(self, parameters: SideShrinking, layout: Layout, robot: Robot) -> None:
+    def __init__(self, parameters: SideShrinking, layout: SensorLayout, robot: Robot) -> None:
         """Start with full amplitude.
 
         Args:
@@ -288,7 +288,7 @@ class TailSpeedUp:
 
     names = ("haste.factor", "haste.distance")
 
-    def __init__(self, parameters: TailHaste, layout: Layout) -> None:
+    def __init__(self, parameters: TailHaste, layout: SensorLayout) -> None:
         """Start with the gait's own frequency.
 
         Args:

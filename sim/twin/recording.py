@@ -61,7 +61,7 @@ def quick_collections() -> Generator[None]:
 
 
 @dataclass(frozen=True)
-class Recording:
+class TwinRecording:
     """What was recorded.
 
     Attributes:
@@ -202,7 +202,7 @@ def record(
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
     kernels: Kernels = Kernels.NUMPY,
-) -> Recording:
+) -> TwinRecording:
     """Run a scenario into a session file.
 
     The file is whole however the run ends: at its planned end, by a stop request (between two
@@ -247,7 +247,7 @@ def record(
             text = f"stopped at {at} of {scenario.duration_s:g} s"
         log.end(verdict, text)
         log.log_event(level, text)
-    return Recording(
+    return TwinRecording(
         path=Path(path),
         session_id=_session_id(scenario, driver, kernels),
         sample_count=sample.tick + 1,

@@ -34,7 +34,7 @@ from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.write.writer import SessionWriter, open_sensor
 from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.capture.robot.model import Joint, Link, Plane, Robot
-from undulog.capture.robot.run import RUN_RECORD, Run, drag_ratio
+from undulog.capture.robot.run import RUN_RECORD, TwinRun, drag_ratio
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..physics.ledger import JOINT_TERMS, TERMS
@@ -316,7 +316,7 @@ class SessionLog:
 def _run_facts(scenario: Scenario, kernels: Kernels) -> dict[str, str]:
     """Entries of the metadata record of what runs."""
     ground = scenario.world.ground
-    run = Run(
+    run = TwinRun(
         physics_rate_hz=scenario.physics_rate_hz,
         start_heading_rad=scenario.world.heading,
         contact=ground is not None or bool(scenario.world.obstacles),

@@ -5,7 +5,7 @@ import numpy as np
 from undulog.capture import load_robot
 from undulog.sim.drive.gate import Gate
 from undulog.sim.drive.limits import gate_limits
-from undulog.sim.drive.outcome import GateInput, JointStatus, Phase
+from undulog.sim.drive.outcome import GateInput, GatePhase, JointStatus
 from undulog.sim.gait.contract import GaitTick, Readings
 
 ROBOT = load_robot("snake25")
@@ -85,7 +85,7 @@ class Bench:
 
     def running(self, ticks=0):
         """Run the gait, so many ticks of it."""
-        self.until(Phase.RUN)
+        self.until(GatePhase.RUN)
         for _ in range(ticks):
             self.step()
         return self

@@ -5,7 +5,7 @@ import math
 import kick_tables
 import numpy as np
 
-from undulog.analysis.experiment.kick_runs import KickExperiment, Kind, sort_kicks
+from undulog.analysis.experiment.kick_runs import KickExperiment, KickKind, sort_kicks
 
 
 def kicked(random, H, c, kicks, scatter, *, bend=0.0, size=1.0, late=0.0, noise=None):
@@ -14,7 +14,7 @@ def kicked(random, H, c, kicks, scatter, *, bend=0.0, size=1.0, late=0.0, noise=
     off = np.zeros((len(kicks), len(c)), dtype=complex)
     for k, kick in enumerate(kicks):
         if kick is not None:
-            off[k, kick.joint] = size * kick.size * (1j if kick.kind is Kind.PHASE else 1.0)
+            off[k, kick.joint] = size * kick.size * (1j if kick.kind is KickKind.PHASE else 1.0)
     commands = c * np.exp(off)
     answers = (commands * (1 - bend * np.abs(commands) ** 2)) @ H.T
     answers = answers * np.exp(1j * late * off.imag.sum(axis=1, keepdims=True))

@@ -14,7 +14,7 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 from undulog.capture.log.health.session_check import check_session
 from undulog.replay.draw.drawing import markdown
 from undulog.replay.samples.content import Content
@@ -126,7 +126,7 @@ def detected(log):
     # Effort is that of the true position, and so is a velocity of its own.
     outside = frozenset({"effort", *(["velocity"] if robot.channels.velocity == "true" else [])})
     motions = [
-        JointMotion(
+        RecordedJoint(
             name,
             Samples(robot.sent_s, sent[:, j]),
             samples(log.position, j),

@@ -15,8 +15,8 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import TINY
 
-from .record import Block
-from .response import Response, centred, dot, followed, rate_of
+from .record import EpisodeBlock
+from .response import EpisodeResponses, centred, dot, followed, rate_of
 
 BLOCK_S = 0.5
 """Length of the blocks of time [s]: time constants of servos, reactions of a person who teaches."""
@@ -92,7 +92,7 @@ class Regression:
     residual: FloatArray
 
 
-def regress(block: Block, response: Response, frames: int = 0) -> Regression:
+def regress(block: EpisodeBlock, response: EpisodeResponses, frames: int = 0) -> Regression:
     """Fit gain, level and lag of a block's episodes.
 
     Args:
@@ -158,7 +158,7 @@ def inflation_of(regression: Regression, fps: float) -> FloatArray:
     return np.maximum(np.stack(ratios), 1.0)
 
 
-def searched(block: Block, response: Response, most: int, fps: float) -> Deviations:
+def searched(block: EpisodeBlock, response: EpisodeResponses, most: int, fps: float) -> Deviations:
     """Search the lags of a block's episodes frame by frame, and return what fits best.
 
     A joint at its largest speed is later in some motions than in others: the errors are those of
@@ -170,7 +170,7 @@ def searched(block: Block, response: Response, most: int, fps: float) -> Deviati
     frames = max(round(BLOCK_S * fps), 1)
     best = regress(block, response, frames).deviations
     for shift in range(-most, most + 1):
-        moved = Response(response.delay + shift, response.constant, response.play)
+        moved = EpisodeResponses(response.delay + shift, response.constant, response.play)
         tried = regress(block, moved, frames).deviations
         tried = replace(tried, lag=tried.lag + shift)
         forward = tried.gain > 0

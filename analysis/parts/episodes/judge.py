@@ -33,8 +33,8 @@ from .deviations import Deviations, searched
 from .jumps import Jumps
 from .outliers import Outliers, median_of, outliers_of, scatter_of, weighted_median
 from .pace import pace_of
-from .record import Block, Record, block_of
-from .response import Response
+from .record import EpisodeBlock, Record, block_of
+from .response import EpisodeResponses
 from .result import EpisodeFault
 
 LEVEL = 0.02
@@ -80,7 +80,7 @@ PER_MEDIAN = 1.2533
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredEpisodes:
     """All that is measured of e episodes and m joints.
 
     Attributes:
@@ -93,8 +93,8 @@ class Measured:
 
     record: Record
     used: IntArray
-    response: Response
-    sample: Block
+    response: EpisodeResponses
+    sample: EpisodeBlock
     deviations: Deviations
     inflation: FloatArray
     jumps: Jumps
@@ -102,7 +102,9 @@ class Measured:
     unasked: FloatArray
 
 
-def faults_of(measured: Measured, unit: str, margin: float) -> tuple[list[EpisodeFault], list[str]]:
+def faults_of(
+    measured: MeasuredEpisodes, unit: str, margin: float
+) -> tuple[list[EpisodeFault], list[str]]:
     """Return what is wrong, worst first, and what isn't decided.
 
     Args:
@@ -124,7 +126,7 @@ def faults_of(measured: Measured, unit: str, margin: float) -> tuple[list[Episod
     return ranked, [*judge.limits, *judge.unknown()]
 
 
-def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def values_of(measured: MeasuredEpisodes) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Return gain (a factor less 1), lag [frames] and offset of each joint, and their errors.
 
     Gain and lag are known where a joint had to move by more than what its model leaves of sound
@@ -151,7 +153,7 @@ def values_of(measured: Measured) -> tuple[dict[str, FloatArray], dict[str, Floa
     return values, errors
 
 
-def _search_again(measured: Measured) -> None:
+def _search_again(measured: MeasuredEpisodes) -> None:
     """Search the lags of episodes in which a joint may be off too far for a linear estimate."""
     values, errors = values_of(measured)
     left = np.log(measured.deviations.left + TINY)
@@ -172,7 +174,7 @@ def _search_again(measured: Measured) -> None:
 class _Judge:
     """The questions, in their order."""
 
-    def __init__(self, measured: Measured, unit: str, margin: float) -> None:
+    def __init__(self, measured: MeasuredEpisodes, unit: str, margin: float) -> None:
         self._m, self._unit, self._margin = measured, unit, margin
         self._values, self._errors = values_of(measured)
         self._level = LEVEL / FAMILIES

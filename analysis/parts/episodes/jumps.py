@@ -27,8 +27,8 @@ from undulog.capture.judgement.levels import HALF, TINY
 
 from .deviations import Regression
 from .outliers import weighted_median
-from .record import Block
-from .response import Response, delayed, dot, lowpass
+from .record import EpisodeBlock
+from .response import EpisodeResponses, delayed, dot, lowpass
 
 SIDE = 4
 """Frames on either side: fewer show no parabola, with more a quick move is none."""
@@ -59,7 +59,7 @@ def windowed(values: FloatArray, kernel: FloatArray) -> FloatArray:
     return total
 
 
-def seen_of(response: Response) -> FloatArray:
+def seen_of(response: EpisodeResponses) -> FloatArray:
     """Return the part of a lost frame's jump that the residual of each joint shows, shape (m,)."""
     step = np.zeros((4 * SIDE, response.delay.size))
     step[2 * SIDE :] = 1.0
@@ -88,7 +88,7 @@ class JumpScale:
     residual: bool
 
 
-def scale_of(block: Block, regression: Regression, response: Response) -> JumpScale:
+def scale_of(block: EpisodeBlock, regression: Regression, response: EpisodeResponses) -> JumpScale:
     """Return what jumps are, from a sample of the episodes."""
     seen = seen_of(response)
     residual = bool(np.median(seen) > LEAST_SEEN)
@@ -138,7 +138,7 @@ class Jumps:
             getattr(self, name)[episodes] = values
 
 
-def jumps_of(block: Block, regression: Regression, scale: JumpScale) -> Jumps:
+def jumps_of(block: EpisodeBlock, regression: Regression, scale: JumpScale) -> Jumps:
     """Look for the frames of each episode that are most likely lost, or there twice."""
     if len(block.inside) < 2 * SIDE + 1 or not scale.usual.any():
         return Jumps.empty(block.episodes.size)
@@ -200,7 +200,7 @@ def dot_joints(left: FloatArray, right: FloatArray) -> FloatArray:
     return np.einsum("tkm,tkm->tk", left, right)
 
 
-def _jumps(block: Block, regression: Regression, *, residual: bool) -> FloatArray:
+def _jumps(block: EpisodeBlock, regression: Regression, *, residual: bool) -> FloatArray:
     if not residual:
         values = block.states
     else:
@@ -209,6 +209,6 @@ def _jumps(block: Block, regression: Regression, *, residual: bool) -> FloatArra
     return windowed(values, JUMP) * _inside(block)[:, :, None]
 
 
-def _inside(block: Block) -> BoolArray:
+def _inside(block: EpisodeBlock) -> BoolArray:
     """Return whether all frames of a window are inside, shape (t - 2 SIDE + 1, k)."""
     return block.inside[2 * SIDE - 1 :]

@@ -12,7 +12,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import COVERAGE, ENOUGH_LIKE, FEWEST
 
 from .deviations import Deviations, inflation_of, regress
-from .judge import Measured, faults_of, unit_of
+from .judge import MeasuredEpisodes, faults_of, unit_of
 from .jumps import Jumps, jumps_of, scale_of
 from .record import Record, block_of, blocks_of
 from .response import fit_response, sample_of
@@ -73,7 +73,7 @@ def measure_episodes(
     )
 
 
-def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) -> Measured:
+def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) -> MeasuredEpisodes:
     motion = _moved(record, record.commands)[used].sum(axis=1)
     sample = block_of(record, used[sample_of(record.lengths[used], motion, SAMPLE)])
     response = fit_response(sample, record.fps)
@@ -94,7 +94,9 @@ def _measured(record: Record, used: IntArray, advance: Callable[[int], None]) ->
         done += at.size
         advance(done)
     inflation = inflation_of(first, record.fps)
-    return Measured(record, used, response, sample, deviations, inflation, jumps, frozen, unasked)
+    return MeasuredEpisodes(
+        record, used, response, sample, deviations, inflation, jumps, frozen, unasked
+    )
 
 
 def _by_itself(record: Record, finite: BoolArray, long_enough: BoolArray) -> Iterator[EpisodeFault]:

@@ -17,8 +17,8 @@ from undulog.capture.judgement.levels import FEWEST, ROBUST, TINY
 
 from ...estimators.intervals import t_factor
 from .deviations import regress
-from .record import Block
-from .response import Response, centred, dot, lowpass
+from .record import EpisodeBlock
+from .response import EpisodeResponses, centred, dot, lowpass
 
 WHOLE_FRAME = 1.0
 """Where neither is decided, what is a frame or more is a delay: loops are late by whole frames."""
@@ -28,7 +28,7 @@ CLOSER = 2.0
 
 
 @dataclass(frozen=True)
-class Pace:
+class EpisodePace:
     """What explains the lags of an episode.
 
     Attributes:
@@ -40,7 +40,13 @@ class Pace:
     decided: bool
 
 
-def pace_of(block: Block, sample: Block, response: Response, slower: float, later: float) -> Pace:
+def pace_of(
+    block: EpisodeBlock,
+    sample: EpisodeBlock,
+    response: EpisodeResponses,
+    slower: float,
+    later: float,
+) -> EpisodePace:
     """Decide for one episode.
 
     Args:
@@ -56,7 +62,7 @@ def pace_of(block: Block, sample: Block, response: Response, slower: float, late
     near, far = sorted((to_delay, to_rate))
     count = sample.episodes.size
     decided = count >= FEWEST and far > max(t_factor(count - 1), CLOSER * near)
-    return Pace(to_rate < to_delay if decided else abs(later) < WHOLE_FRAME, decided)
+    return EpisodePace(to_rate < to_delay if decided else abs(later) < WHOLE_FRAME, decided)
 
 
 def _distance(value: float, sound: FloatArray) -> float:
@@ -66,13 +72,13 @@ def _distance(value: float, sound: FloatArray) -> float:
     return abs(value - middle) / (scatter * float(np.sqrt(1 + 1 / sound.size)) + TINY)
 
 
-def shifted(block: Block, later: float) -> Block:
+def shifted(block: EpisodeBlock, later: float) -> EpisodeBlock:
     """Return episodes whose states are later [frames]."""
     times: FloatArray = np.arange(len(block.states), dtype=np.float64) - later
     return replace(block, states=_at(block.states, times))
 
 
-def paced(block: Block, rate: float) -> Block:
+def paced(block: EpisodeBlock, rate: float) -> EpisodeBlock:
     """Return episodes as they are at another rate, times the one that they have."""
     times: FloatArray = np.arange(len(block.states), dtype=np.float64) / rate
     whole = np.minimum(np.ceil(times), len(times) - 1).astype(np.int64)
@@ -93,7 +99,7 @@ def _at(values: FloatArray, times: FloatArray) -> FloatArray:
     return values[first] * (1 - part) + values[np.minimum(first + 1, len(values) - 1)] * part
 
 
-def constants_of(block: Block, response: Response) -> FloatArray:
+def constants_of(block: EpisodeBlock, response: EpisodeResponses) -> FloatArray:
     """Return by what part the time constants of each episode are longer, over its joints, (k,).
 
     A step of Gauss and Newton in the time constants, with gains, offsets and delays free.

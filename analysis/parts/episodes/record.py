@@ -46,7 +46,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Block:
+class EpisodeBlock:
     """Some episodes side by side.
 
     Attributes:
@@ -62,12 +62,12 @@ class Block:
     states: FloatArray
 
 
-def block_of(record: Record, episodes: IntArray) -> Block:
+def block_of(record: Record, episodes: IntArray) -> EpisodeBlock:
     """Return some episodes, which have a frame each at least, as a block."""
     lengths = record.lengths[episodes]
     steps = np.arange(int(lengths.max()))[:, None]
     rows = record.starts[episodes] + np.minimum(steps, lengths - 1)
-    return Block(
+    return EpisodeBlock(
         episodes,
         steps < lengths,
         record.commands[rows].astype(np.float64, copy=False),
@@ -75,7 +75,7 @@ def block_of(record: Record, episodes: IntArray) -> Block:
     )
 
 
-def blocks_of(record: Record, episodes: IntArray) -> Iterator[Block]:
+def blocks_of(record: Record, episodes: IntArray) -> Iterator[EpisodeBlock]:
     """Yield all of these episodes in blocks, the shortest first."""
     lengths = record.lengths[episodes]
     order = episodes[np.argsort(lengths, kind="stable")]

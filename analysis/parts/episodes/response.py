@@ -18,7 +18,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import TINY, WHOLE
 
-from .record import Block
+from .record import EpisodeBlock
 
 LATEST_S = 0.5
 """Longest delay and largest time constant that are tried [s]."""
@@ -40,7 +40,7 @@ SETTLED = 3
 
 
 @dataclass(frozen=True)
-class Response:
+class EpisodeResponses:
     """Equation (1) of m joints.
 
     Attributes:
@@ -132,7 +132,7 @@ def play_of(values: FloatArray, half: FloatArray) -> FloatArray:
     return outputs
 
 
-def followed(block: Block, response: Response) -> FloatArray:
+def followed(block: EpisodeBlock, response: EpisodeResponses) -> FloatArray:
     """Return x of equation (1) behind the backlash, shape (t, k, m)."""
     passed = lowpass(block.commands, response.constant)
     x = delayed(block.commands, passed, response.delay, response.constant)
@@ -156,7 +156,7 @@ def dot(left: FloatArray, right: FloatArray) -> FloatArray:
     return np.einsum("tkm,tkm->km", left, right)
 
 
-def fit_response(block: Block, fps: float) -> Response:
+def fit_response(block: EpisodeBlock, fps: float) -> EpisodeResponses:
     """Fit the response of each joint to a sample of the episodes.
 
     Args:
@@ -176,7 +176,7 @@ def fit_response(block: Block, fps: float) -> Response:
 class _Fitter:
     """Sample of the episodes, with the states less their mean and the sum of their squares."""
 
-    block: Block
+    block: EpisodeBlock
     weights: FloatArray
     y: FloatArray
     power: FloatArray
@@ -197,7 +197,7 @@ class _Fitter:
         limit = np.quantile(share, WHOLE, axis=0, method="higher")
         return share <= limit
 
-    def searched(self, constants: FloatArray, latest: int) -> Response:
+    def searched(self, constants: FloatArray, latest: int) -> EpisodeResponses:
         """Return the best of a grid of whole delays and some constants."""
         m = int(self.y.shape[2])
         best = np.full(m, np.inf)
@@ -209,9 +209,9 @@ class _Fitter:
                 squares = self.pooled(self.left(centred(moved, self.weights)))
                 better = squares < best
                 best[better], delay[better], constant[better] = squares[better], d, a
-        return Response(delay, constant, np.zeros(m))
+        return EpisodeResponses(delay, constant, np.zeros(m))
 
-    def improved(self, response: Response, latest: int) -> Response:
+    def improved(self, response: EpisodeResponses, latest: int) -> EpisodeResponses:
         """Take steps of Gauss and Newton in d and a, over the episodes that fit best."""
         x = centred(followed(self.block, response), self.weights)
         left = self.left(x)
@@ -220,7 +220,7 @@ class _Fitter:
         size = np.ones_like(squares)
         for _ in range(STEPS):
             step_d, step_a = self._step(response, x, kept)
-            tried = Response(
+            tried = EpisodeResponses(
                 np.clip(response.delay + size * step_d, -1.0, latest),
                 np.clip(response.constant + size * step_a, 0.0, latest),
                 response.play,
@@ -238,7 +238,7 @@ class _Fitter:
         return response
 
     def _step(
-        self, response: Response, x: FloatArray, kept: BoolArray
+        self, response: EpisodeResponses, x: FloatArray, kept: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the steps of d and a, from derivatives less their part along x."""
         gain = dot(x, self.y) / np.maximum(dot(x, x), TINY)
@@ -257,7 +257,7 @@ class _Fitter:
         determinant = np.maximum(dd * aa - da**2, TINY)
         return (aa * dr - da * ar) / determinant, (dd * ar - da * dr) / determinant
 
-    def with_play(self, response: Response, latest: int) -> Response:
+    def with_play(self, response: EpisodeResponses, latest: int) -> EpisodeResponses:
         """Return the response with the backlash that leaves least, if that is less."""
         commands = self.block.commands
         usual = np.asarray(np.median(commands.max(axis=0) - commands.min(axis=0), axis=0), float)
@@ -265,7 +265,9 @@ class _Fitter:
         squares = self.pooled(self.left(centred(followed(self.block, response), self.weights)))
         squares = squares * LESS
         for part in PLAYS[1:]:
-            tried = self.improved(Response(response.delay, response.constant, part * usual), latest)
+            tried = self.improved(
+                EpisodeResponses(response.delay, response.constant, part * usual), latest
+            )
             now = self.pooled(self.left(centred(followed(self.block, tried), self.weights)))
             better = now < squares
             squares = np.where(better, now, squares)
@@ -273,9 +275,9 @@ class _Fitter:
         return best
 
 
-def chosen(better: BoolArray, tried: Response, best: Response) -> Response:
+def chosen(better: BoolArray, tried: EpisodeResponses, best: EpisodeResponses) -> EpisodeResponses:
     """Return one of two responses for each joint."""
-    return Response(
+    return EpisodeResponses(
         np.where(better, tried.delay, best.delay),
         np.where(better, tried.constant, best.constant),
         np.where(better, tried.play, best.play),

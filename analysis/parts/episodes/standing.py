@@ -14,14 +14,14 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.judgement.levels import QUARTER
 
 from .deviations import Regression
-from .record import Block
+from .record import EpisodeBlock
 
 WINDOW_S = 1.0
 """Length of a window [s]: longer than the lag of a servo."""
 
 
 def standing_of(
-    block: Block, regression: Regression, gain: FloatArray, fps: float
+    block: EpisodeBlock, regression: Regression, gain: FloatArray, fps: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the largest motion of the other signal while states, or commands, stand.
 
@@ -41,7 +41,7 @@ def standing_of(
     return frozen.max(axis=0, initial=0.0), unasked.max(axis=0, initial=0.0)
 
 
-def _ranges(values: FloatArray, block: Block, half: int) -> tuple[FloatArray, FloatArray]:
+def _ranges(values: FloatArray, block: EpisodeBlock, half: int) -> tuple[FloatArray, FloatArray]:
     """Return the range of values in windows of two halves, and with one more on either side.
 
     The windows overlap by half. One that isn't wholly inside has none: its range is 0.

@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 
 from ...common.arrays import IntArray
 from ...common.errors import LogError
-from ...common.process import Piece, helpers
+from ...common.process import WorkPiece, helpers
 from ..file.log_file import LogFile, keep_freed, new_pages
 from ..mcap.chunk import (
     BODY_AT,
@@ -32,7 +32,7 @@ from ..mcap.chunk import (
     PREFIX_SIZE,
     Block,
     Buffer,
-    Places,
+    MessageOffsets,
     gather,
     read_message_heads,
 )
@@ -162,13 +162,15 @@ def _begun(
     runs: Iterable[list[Placed] | Block],
     arenas: Sequence[mmap.mmap],
     pool: ThreadPoolExecutor | None,
-) -> Iterator[list[Piece[_Found]]]:
+) -> Iterator[list[WorkPiece[_Found]]]:
     """Yield the work on each run, submitted to the helpers."""
     for run, arena in zip(runs, cycle(arenas), strict=False):
         if isinstance(run, list):
-            yield [Piece(partial(_inflated, log_file, arena, placed), pool) for placed in run]
+            yield [WorkPiece(partial(_inflated, log_file, arena, placed), pool) for placed in run]
         else:  # of those larger than a buffer only one at a time
-            yield [Piece(partial(_alone, log_file, run), pool if run.size <= ARENA_SIZE else None)]
+            yield [
+                WorkPiece(partial(_alone, log_file, run), pool if run.size <= ARENA_SIZE else None)
+            ]
 
 
 def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
@@ -205,7 +207,7 @@ class Records:
     offsets: IntArray
     log_ns: IntArray
     length: int | None
-    bodies: Places
+    bodies: MessageOffsets
 
 
 def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
@@ -282,14 +284,16 @@ def _records(
     found: list[Records] = []
     for starts in _indexed(log_file, placed, wanted):
         at = starts.offsets
-        records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
+        records = (
+            _alike(data, starts) if len(at) else Records(at, at, None, MessageOffsets(data, at))
+        )
         if records is None:
             if read_message_heads(data, at, np.repeat(starts.ends, starts.counts)) is None:
                 raise LogError(
                     log_file.path, "a message index points to something that is not a message"
                 )
             log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
-            records = Records(at, log_ns, None, Places(data, at + BODY_AT))
+            records = Records(at, log_ns, None, MessageOffsets(data, at + BODY_AT))
         found.append(records)
     return found
 
@@ -310,19 +314,19 @@ def _tiled(
         return None
     if any((one.stop - one.base) % size for one in placed):
         return None
-    places = Places(data, np.arange(base, stop, size, dtype=np.int64), size)
+    places = MessageOffsets(data, np.arange(base, stop, size, dtype=np.int64), size)
     if places.field(_CHANNEL_START_KIND, 0).tobytes() != start * len(places):
         return None
     nothing = np.empty(0, dtype=np.int64)
-    none = Records(nothing, nothing, None, Places(data, nothing))
+    none = Records(nothing, nothing, None, MessageOffsets(data, nothing))
     own = _records_at(places.at, places, length)
     return [own if channel_id in channel_ids else none for channel_ids in wanted]
 
 
-def _records_at(offsets: IntArray, places: Places, length: int) -> Records:
+def _records_at(offsets: IntArray, places: MessageOffsets, length: int) -> Records:
     """Return records of whole messages of one length, from their offsets and their positions."""
     log_ns = _readable(places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy())
-    bodies = Places(places.data, places.at + BODY_AT, places.step)
+    bodies = MessageOffsets(places.data, places.at + BODY_AT, places.step)
     return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
 
 
@@ -342,10 +346,10 @@ def _alike(data: Buffer, starts: _Starts) -> Records | None:
     if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= starts.room - PREFIX_SIZE:
         return None
     size = PREFIX_SIZE + length
-    places = Places(data, offsets)
+    places = MessageOffsets(data, offsets)
     if size <= _LARGEST_COPIED:
         copied = gather(data, offsets, f"V{size}").view(np.uint8)
-        places = Places(copied, np.arange(0, len(copied), size, dtype=np.int64), size)
+        places = MessageOffsets(copied, np.arange(0, len(copied), size, dtype=np.int64), size)
     if places.field(_START_KIND, 0).tobytes() != start * len(offsets):
         return None
     return _records_at(offsets, places, length)

@@ -16,7 +16,7 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import BODY_AT, FIXED_SIZE, Places
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, MessageOffsets
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_LISTS, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
@@ -183,12 +183,16 @@ class _GroupReader:
             else:
                 self._sort_in(length, places, log_ns, np.arange(first, self._count))
             return
-        lengths = Places(places.data, places.at - BODY_AT).field("<i8", _LENGTH_AT) - FIXED_SIZE
+        lengths = (
+            MessageOffsets(places.data, places.at - BODY_AT).field("<i8", _LENGTH_AT) - FIXED_SIZE
+        )
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
             self._sort_in(length, places.take(rows), log_ns[rows], first + rows)
 
-    def _sort_in(self, length: int, places: Places, log_ns: IntArray, order: IntArray) -> None:
+    def _sort_in(
+        self, length: int, places: MessageOffsets, log_ns: IntArray, order: IntArray
+    ) -> None:
         """Add messages of one length and any layouts."""
         matrix = places.rows(np.dtype(np.uint8), length, 0)
         for rows, layout, number, _ in self._sorter.sort(matrix):

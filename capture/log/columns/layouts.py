@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...common.arrays import NS, IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages
-from ..mcap.chunk import Places
+from ..mcap.chunk import MessageOffsets
 from ..messages.cdr import Layout, Leaf
 from .buffers import ColumnStore, Times, TimeStore
 from .names import distinct_names
@@ -36,7 +36,7 @@ _COMPARED = 1 << 17
 """Bytes of constant parts that are compared at once: they stay in the cache."""
 
 
-class Part(NamedTuple):
+class LayoutMessages(NamedTuple):
     """Messages of one layout.
 
     Attributes:
@@ -75,7 +75,7 @@ class LayoutSorter:
         self._kept: dict[int, list[tuple[int, Layout]]] = {}
         self._found = self._kept_in_all = 0
 
-    def sort(self, matrix: Matrix) -> Iterator[Part]:
+    def sort(self, matrix: Matrix) -> Iterator[LayoutMessages]:
         """Sort messages of one length.
 
         Args:
@@ -92,17 +92,17 @@ class LayoutSorter:
             fits = _fits(matrix, layout)
             count = np.count_nonzero(fits)
             if count == len(rows):  # the usual case: nothing to pick
-                yield Part(rows, layout, number, is_kept=True)
+                yield LayoutMessages(rows, layout, number, is_kept=True)
                 return
             if count:
-                yield Part(rows[fits], layout, number, is_kept=True)
+                yield LayoutMessages(rows[fits], layout, number, is_kept=True)
                 rows, matrix = rows[~fits], matrix[~fits]
         while len(rows):
             fits, rest = slice(0, 1), slice(1, None)
             try:
                 layout = self._find(matrix[0].tobytes())
             except DataError as error:
-                yield Part(rows[fits], error)
+                yield LayoutMessages(rows[fits], error)
             else:
                 number = self._found
                 is_kept = (self._kept_in_all if self._in_all else len(kept)) < self._most
@@ -114,7 +114,7 @@ class LayoutSorter:
                 self._found += 1
                 self._kept_in_all += is_kept
                 self.is_full |= not is_kept
-                yield Part(rows[fits], layout, number, is_kept)
+                yield LayoutMessages(rows[fits], layout, number, is_kept)
             rows, matrix = rows[rest], matrix[rest]
 
 
@@ -206,7 +206,7 @@ class Stamping:
         self._raw: NDArray[Any] = np.empty(0, dtype="<i8")
         self._times: Times | None = None
 
-    def times(self, places: Places, log_ns: IntArray, stamp: tuple[Leaf, Leaf]) -> Times:
+    def times(self, places: MessageOffsets, log_ns: IntArray, stamp: tuple[Leaf, Leaf]) -> Times:
         """Return the times of n messages; the cached object if they are equal.
 
         Args:
@@ -314,7 +314,7 @@ class Group:
             return np.empty((len(self), 0), dtype=np.float64)
         return self._columns[path].values()
 
-    def holds(self, places: Places) -> bool:
+    def holds(self, places: MessageOffsets) -> bool:
         """Whether all messages, which have its length, have this layout and equal padding."""
         for k, (start, run) in enumerate(self._hull):
             count = _COMPARED // run.itemsize + 1
@@ -326,7 +326,7 @@ class Group:
                     return False
         return True
 
-    def take(self, places: Places, log_ns: IntArray, order: IntArray | range) -> None:
+    def take(self, places: MessageOffsets, log_ns: IntArray, order: IntArray | range) -> None:
         """Copy n messages of this layout.
 
         Args:

@@ -69,7 +69,7 @@ class Allowance:
 
 
 @dataclass(frozen=True)
-class Part:
+class BagPart:
     """One file of a recording, open.
 
     Attributes:
@@ -85,7 +85,7 @@ class Part:
 
 
 @contextmanager
-def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Generator[Part]:
+def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Generator[BagPart]:
     """Open one file of a recording.
 
     Args:
@@ -126,12 +126,12 @@ def _pieces(packed: BinaryIO | bytes, allowance: Allowance, size: int) -> Iterat
             yield piece
 
 
-def _of_messages(part: Part, allowance: Allowance) -> Part:
+def _of_messages(part: BagPart, allowance: Allowance) -> BagPart:
     def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
         for connection, t_ns, data in part.messages():
             yield connection, t_ns, None if data is None else _expanded(data, allowance)
 
-    return Part(part.connections, part.count, messages, part.warnings)
+    return BagPart(part.connections, part.count, messages, part.warnings)
 
 
 def _expanded(data: bytes, allowance: Allowance) -> bytes | None:
@@ -150,7 +150,7 @@ def _expanded(data: bytes, allowance: Allowance) -> bytes | None:
 
 
 @contextmanager
-def _mcap(path: Path) -> Generator[Part]:
+def _mcap(path: Path) -> Generator[BagPart]:
     with closing(McapFile(path)) as file:
         ways: dict[int, Connection] = {}
         for key, channel in file.channels.items():
@@ -184,7 +184,7 @@ def _mcap(path: Path) -> Generator[Part]:
                             at = body - PREFIX_SIZE + BODY_AT
                             yield ways[key], log_ns, bytes(data[at:end])
 
-        yield Part(list(ways.values()), sum(file.counts.values()), messages, warnings)
+        yield BagPart(list(ways.values()), sum(file.counts.values()), messages, warnings)
 
 
 def _end(data: Any, at: int) -> int:
@@ -193,7 +193,7 @@ def _end(data: Any, at: int) -> int:
 
 
 @contextmanager
-def _sqlite(path: Path) -> Generator[Part]:
+def _sqlite(path: Path) -> Generator[BagPart]:
     with _connected(path) as base:
         yield _database(base)
 
@@ -234,7 +234,7 @@ def read_database_facts(path: Path) -> Stated:
     return Stated([path], "", first, last - first, count, names)
 
 
-def _database(base: sqlite3.Connection) -> Part:
+def _database(base: sqlite3.Connection) -> BagPart:
     check_pages(base)
     definitions: dict[str, tuple[str, str]] = {}
     if "message_definitions" in table_names(base):
@@ -260,7 +260,7 @@ def _database(base: sqlite3.Connection) -> Part:
             whole = isinstance(data, bytes) and isinstance(t_ns, int) and t_ns >= 0
             yield ways[key], t_ns if whole else 0, data if whole else None
 
-    return Part(list(ways.values()), count, messages, [])
+    return BagPart(list(ways.values()), count, messages, [])
 
 
 _READERS = {".mcap": _mcap, ".db3": _sqlite}

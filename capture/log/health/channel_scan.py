@@ -46,7 +46,7 @@ Limits = dict[str, tuple[float, float]]
 
 
 @dataclass
-class Series:
+class NameTallies:
     """Tallies of the messages that carry the same names.
 
     Attributes:
@@ -117,7 +117,7 @@ class ChannelScan:
         self.topic = topic
         self.count = self.unread = 0
         self.sequence = SequenceTally()
-        self.series: dict[tuple[str, ...], Series] = {}
+        self.series: dict[tuple[str, ...], NameTallies] = {}
         framed = kind is not None and kind.name == "std_msgs/msg/UInt8MultiArray"
         framed = framed and topic.startswith(wire.FRAME_TOPIC_PREFIXES)
         self.bus = BusTally(horizon_s) if framed else None
@@ -215,9 +215,9 @@ class ChannelScan:
                 for layout, _, part in self._by_layout(matrix):
                     _count_nan(series, layout, part)
 
-    def _series_of(self, names: tuple[str, ...]) -> Series:
+    def _series_of(self, names: tuple[str, ...]) -> NameTallies:
         if names not in self.series:
-            self.series[names] = Series(names, ranges=RangeTally(self._horizon_s))
+            self.series[names] = NameTallies(names, ranges=RangeTally(self._horizon_s))
         return self.series[names]
 
     def _keep_ends(self, whole: list[tuple[IntArray, Matrix]]) -> None:
@@ -230,7 +230,7 @@ class ChannelScan:
         late = last[1][int(last[0].argmax())].tobytes()
         self.ends = (early if self.ends is None else self.ends[0], late)
 
-    def _add_times(self, names: tuple[str, ...], stamps: IntArray, log_ns: IntArray) -> Series:
+    def _add_times(self, names: tuple[str, ...], stamps: IntArray, log_ns: IntArray) -> NameTallies:
         series = self._series_of(names)
         series.timing.add(stamps)
         series.first_log_ns = min(series.first_log_ns, int(log_ns.min()))
@@ -252,7 +252,9 @@ class ChannelScan:
             ordered = np.sort(np.concatenate(chosen))
             self._add_times(names, stamps[ordered], log_ns[ordered])
 
-    def _add_values(self, series: Series, layout: Layout, part: Matrix, stamps: IntArray) -> None:
+    def _add_values(
+        self, series: NameTallies, layout: Layout, part: Matrix, stamps: IntArray
+    ) -> None:
         fields = [_numbers(layout, name, part) for name in _FIELDS]
         fields = [values for values in fields if values.shape[1] == len(series.names) > 0]
         if not fields:
@@ -338,7 +340,7 @@ def _numbers(layout: Layout, path: str, part: Matrix) -> FloatArray:
     return values_of(layout, path, part).astype(np.float64, copy=False)
 
 
-def _count_nan(series: Series, layout: Layout, part: Matrix) -> None:
+def _count_nan(series: NameTallies, layout: Layout, part: Matrix) -> None:
     for path, leaf in layout.leaves.items():
         if leaf.dtype in ("<f4", "<f8"):
             series.numbers += len(part) * leaf.count

@@ -28,7 +28,7 @@ WAITING = Finding(0, f"{WAITS_FOR_COMMANDS}: the robot reports its joints, and n
 
 
 @dataclass(frozen=True)
-class Fault:
+class ChannelFault:
     """A fault of one channel, or of one joint of it.
 
     Attributes:
@@ -51,7 +51,7 @@ class Fault:
     late: bool = False
 
 
-def joined(faults: Iterable[Fault]) -> list[Finding]:
+def joined(faults: Iterable[ChannelFault]) -> list[Finding]:
     """Join equal faults of several channels and joints to one finding each.
 
     A lost bus cycle, for instance, is missing in every joint and on every topic of the cycle.
@@ -64,12 +64,12 @@ def joined(faults: Iterable[Fault]) -> list[Finding]:
     Returns:
         The findings, in the order of the first fault of each.
     """
-    groups: list[list[Fault]] = []
-    by_text: dict[tuple[int, str], list[Fault]] = {}
+    groups: list[list[ChannelFault]] = []
+    by_text: dict[tuple[int, str], list[ChannelFault]] = {}
     for fault in faults:
         if fault.gaps:
             found = (group for group in groups if _one_loss(group[0], fault))
-            group = next(found, list[Fault]())
+            group = next(found, list[ChannelFault]())
         else:
             group = by_text.setdefault((fault.weight, fault.text), [])
         if not group:
@@ -78,7 +78,7 @@ def joined(faults: Iterable[Fault]) -> list[Finding]:
     return [_finding(group) for group in groups]
 
 
-def _one_loss(fault: Fault, other: Fault) -> bool:
+def _one_loss(fault: ChannelFault, other: ChannelFault) -> bool:
     """Whether the gaps of two channels are of one loss: equal in number, the longest overlap."""
     if not fault.gaps or (fault.weight, fault.gaps, fault.late) != (
         other.weight,
@@ -90,7 +90,7 @@ def _one_loss(fault: Fault, other: Fault) -> bool:
     return 2 * (min(end, stop) - max(begin, start)) > min(end - begin, stop - start)
 
 
-def _finding(group: Sequence[Fault]) -> Finding:
+def _finding(group: Sequence[ChannelFault]) -> Finding:
     worst = max(group, key=lambda fault: fault.part)
     where = _where(group)
     if len(group) == 1:
@@ -99,7 +99,7 @@ def _finding(group: Sequence[Fault]) -> Finding:
     return Finding(worst.weight, f"{where}, {each} {worst.text}")
 
 
-def _where(group: Sequence[Fault]) -> str:
+def _where(group: Sequence[ChannelFault]) -> str:
     """Name the channels and joints; topics of the same joints together."""
     names: dict[str, list[str]] = {}
     for fault in group:

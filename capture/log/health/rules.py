@@ -16,7 +16,7 @@ from ..messages.definitions import VERDICTS
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from ..read.facts import TIMES_FROM_FPS
 from ..read.joint_messages import JOINT_TYPES
-from .findings import WAITING, Fault, Finding
+from .findings import WAITING, ChannelFault, Finding
 from .freeze import FROZEN_SAMPLES
 from .tallies import (
     NS,
@@ -101,20 +101,22 @@ def judge_made_times(facts: Mapping[str, str]) -> Iterator[Finding]:
         )
 
 
-def judge_channel(health: ChannelHealth) -> Iterator[Fault]:
+def judge_channel(health: ChannelHealth) -> Iterator[ChannelFault]:
     """Yield what is wrong with one channel."""
     topic, expected = health.topic, health.count + (health.sequence.dropped or 0)
     if health.sequence.dropped:
         part = health.sequence.dropped / expected
         dropped = f"{health.sequence.dropped} of {expected} messages were dropped ({part:.2%})"
         text = f"{dropped}, as its sequence numbers prove"
-        yield Fault(2 if part >= BAD_LOSS else 1, topic, "", text)
+        yield ChannelFault(2 if part >= BAD_LOSS else 1, topic, "", text)
     if health.sequence.reordered:
-        yield Fault(0, topic, "", f"{health.sequence.reordered} messages are out of sequence")
+        yield ChannelFault(
+            0, topic, "", f"{health.sequence.reordered} messages are out of sequence"
+        )
     if health.unread:
         weight = 2 if health.unread >= BAD_LOSS * health.count else 1
         text = f"{health.unread} of {health.count} messages can't be decoded"
-        yield Fault(weight, topic, "", text)
+        yield ChannelFault(weight, topic, "", text)
 
 
 def has_rhythm(topic: str) -> bool:
@@ -124,7 +126,7 @@ def has_rhythm(topic: str) -> bool:
 
 def judge_series(
     health: SeriesHealth, start_ns: int, end_ns: int, commands_ns: int | None = None
-) -> Iterator[Fault]:
+) -> Iterator[ChannelFault]:
     """Yield what is wrong with the names and the rhythm of one series.
 
     Args:
@@ -136,7 +138,7 @@ def judge_series(
         The faults; none for view aids and for the recorder's own topics.
     """
     for sentence in one_name_sentences([health.names]):
-        yield Fault(1, health.topic, "", f"{sentence}; give each its name")
+        yield ChannelFault(1, health.topic, "", f"{sentence}; give each its name")
     timing, label = health.timing, health.label
     if timing.median_s is None or not has_rhythm(health.topic):
         return
@@ -148,24 +150,26 @@ def judge_series(
         yield from _gaps(health, when, mostly_paused=mostly_paused)
     elif joints and timing.paused_s:
         text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
-        yield Fault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
+        yield ChannelFault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
     if timing.regular:
         found = _edges_and_jitter(health, start_ns, end_ns, commands_ns)
-        yield from (Fault(weight, label, "", text) for weight, text in found)
+        yield from (ChannelFault(weight, label, "", text) for weight, text in found)
     elif joints and timing.count > FROZEN_SAMPLES:
-        yield Fault(0, label, "", "no steady rate, so single gaps can't be found")
+        yield ChannelFault(0, label, "", "no steady rate, so single gaps can't be found")
     if timing.backward:
-        yield Fault(1, label, "", f"{timing.backward} stamps go back in time")
+        yield ChannelFault(1, label, "", f"{timing.backward} stamps go back in time")
     if timing.duplicates:
         caught_up = health.topic == COMMAND_TOPIC and timing.late  # several cycles at once
         weight = int(timing.duplicates > GOOD_LOSS * timing.count and not caught_up)
-        yield Fault(weight, label, "", f"{timing.duplicates} stamps are repeated")
+        yield ChannelFault(weight, label, "", f"{timing.duplicates} stamps are repeated")
     if health.nan and not joints:
         weight = int(health.nan > GOOD_LOSS * health.numbers)
-        yield Fault(weight, label, "", f"{health.nan} of {health.numbers} numbers are not a number")
+        yield ChannelFault(
+            weight, label, "", f"{health.nan} of {health.numbers} numbers are not a number"
+        )
 
 
-def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[Fault]:
+def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[ChannelFault]:
     """Yield the faults of the gaps of a series: lost samples, and a sender that was late."""
     timing = health.timing
     lost, longest = timing.gaps - timing.late, f"the longest is {timing.longest_s:.3g} s, {when}"
@@ -173,7 +177,7 @@ def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[F
     where = (timing.longest_at_ns, timing.longest_at_ns + round(timing.longest_s * NS))
     if lost:
         scattered = timing.scattered / (timing.count + timing.scattered)
-        yield Fault(
+        yield ChannelFault(
             2
             if scattered >= BAD_LOSS or mostly_paused
             else int(timing.missing_part > GOOD_LOSS or long),
@@ -186,7 +190,7 @@ def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Iterator[F
         )
     if timing.late:
         cycles = "command cycles" if health.topic == COMMAND_TOPIC else "cycles"
-        yield Fault(
+        yield ChannelFault(
             int(long and not lost),
             health.label,
             "",
@@ -219,7 +223,7 @@ def _edges_and_jitter(
         yield 1, f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
 
 
-def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[Fault]:
+def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[ChannelFault]:
     """Yield what is wrong with the joints, each by itself.
 
     Args:
@@ -231,10 +235,10 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> Iterator[Fault
         first = next(joint for joint in joints if joint.topic == topic and _is_frozen(joint))
         when = _at(first.frozen_at_ns, start_ns)
         text = f"all joints repeat their values for {first.frozen_s} s while their commands move, "
-        yield Fault(1, topic, "", f"{text}{when}: the bus, its driver or the robot paused")
+        yield ChannelFault(1, topic, "", f"{text}{when}: the bus, its driver or the robot paused")
     for joint in joints:
         for weight, text in _joint_faults(joint, start_ns, alone=joint.topic not in together):
-            yield Fault(weight, joint.topic, joint.name, text)
+            yield ChannelFault(weight, joint.topic, joint.name, text)
 
 
 def _by_topic(joints: Iterable[JointHealth]) -> dict[str, list[JointHealth]]:

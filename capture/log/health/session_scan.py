@@ -20,7 +20,7 @@ from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
 from .bus_tally import SourceHealth, judge_source, measure_sources, named_identifiers, undecoded
-from .channel_scan import ChannelScan, Limits, Series
+from .channel_scan import ChannelScan, Limits, NameTallies
 from .findings import WAITING, Finding, joined
 from .freeze import FreezeTally
 from .rules import (
@@ -297,7 +297,7 @@ class SessionScan:
         return tuple(healths.values())
 
     def _frozen(
-        self, key: int, series: Series, scans: list[tuple[int, ChannelScan]]
+        self, key: int, series: NameTallies, scans: list[tuple[int, ChannelScan]]
     ) -> dict[int, list[tuple[int, int]]]:
         """Return frozen seconds and the first one, for each joint with a command, by its index."""
         measured = series.ranges.result(len(series.names))
@@ -344,7 +344,7 @@ class SessionScan:
         return self._robot.bus.bitrate
 
 
-def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
+def _series(topic: str, type_name: str, tally: NameTallies) -> SeriesHealth:
     return SeriesHealth(
         topic=topic,
         type_name=type_name,

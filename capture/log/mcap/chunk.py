@@ -340,7 +340,7 @@ def gather(
 
 
 @dataclass(frozen=True)
-class Places:
+class MessageOffsets:
     """Offsets of messages in a buffer.
 
     Attributes:
@@ -356,12 +356,12 @@ class Places:
         """Number of messages."""
         return len(self.at)
 
-    def take(self, rows: NDArray[Any] | slice) -> Places:
+    def take(self, rows: NDArray[Any] | slice) -> MessageOffsets:
         """Return some of them, in order; evenly spaced if none between them is left out."""
         at, step = self.at[rows], self.step
         if step is not None and len(at) and int(at[-1] - at[0]) != step * (len(at) - 1):
             step = None
-        return Places(self.data, at, step)
+        return MessageOffsets(self.data, at, step)
 
     def field(self, kind: np.dtype[Any] | str, shift: int) -> NDArray[Any]:
         """Return one field of each message.

@@ -41,7 +41,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from ...common.process import Piece
+from ...common.process import WorkPiece
 from .batch import SEQUENCE_MASK, MessageBatch
 from .chunk import BODY_AT, FIXED_SIZE, HEAD, MAGIC, MESSAGE, PREFIX_SIZE
 
@@ -111,7 +111,7 @@ class _FullChunk:
     began: int
     index: dict[int, array[int]]
     size: int
-    packed: Piece[tuple[bytes, int]]
+    packed: WorkPiece[tuple[bytes, int]]
 
 
 class McapWriter:
@@ -414,7 +414,9 @@ class McapWriter:
     def _finish_chunk(self, chunk: _OpenChunk) -> None:
         """Compress a chunk that has messages, and write the earlier ones that would be too many."""
         size, pack = len(chunk.data), partial(self._compressor.pack, chunk.data)
-        self._full.append(_FullChunk(chunk.began, chunk.index, size, Piece(pack, self._helpers)))
+        self._full.append(
+            _FullChunk(chunk.began, chunk.index, size, WorkPiece(pack, self._helpers))
+        )
         self._waiting += size
         chunk.data, chunk.index = bytearray(), {}
         del self._begun[chunk.group]

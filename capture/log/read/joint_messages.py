@@ -245,7 +245,7 @@ def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tu
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class JointTrajectory:
     """The points of one message.
 
     Attributes:
@@ -293,7 +293,7 @@ class _Cursor:
         return np.frombuffer(self._message, np.float64, count, at)
 
 
-def read_trajectory(log_ns: int, message: bytes) -> Trajectory:
+def read_trajectory(log_ns: int, message: bytes) -> JointTrajectory:
     """Decode a ``trajectory_msgs/JointTrajectory``.
 
     Raises:
@@ -320,12 +320,12 @@ def read_trajectory(log_ns: int, message: bytes) -> Trajectory:
         else np.empty((count, 0))
         for field, row in rows.items()
     }
-    return Trajectory(log_ns, stamp_ns, names, after_ns, values)
+    return JointTrajectory(log_ns, stamp_ns, names, after_ns, values)
 
 
 def trajectories(
     messages: Iterable[tuple[int, bytes]], warn: Callable[[str], None]
-) -> Iterator[Trajectory]:
+) -> Iterator[JointTrajectory]:
     """Decode trajectories; ``warn`` is called once if some are damaged."""
     lost, why = 0, ""
     for log_ns, message in messages:
@@ -338,7 +338,7 @@ def trajectories(
 
 
 def points_in_force(
-    every: Sequence[Trajectory], field: str, shift_ns: int
+    every: Sequence[JointTrajectory], field: str, shift_ns: int
 ) -> tuple[list[tuple[tuple[str, ...], IntArray, FloatArray]], int]:
     """Return the points of trajectories as commands.
 

@@ -24,7 +24,7 @@ from .joint_messages import (
     UNITS,
     JointRows,
     JointSource,
-    Trajectory,
+    JointTrajectory,
     carried,
     check_source,
     joint_source,
@@ -35,7 +35,7 @@ from .joint_messages import (
     sampled,
     trajectories,
 )
-from .sample_times import JointSignals, Series, StampClock, cut, own_times
+from .sample_times import JointSeries, JointSignals, StampClock, cut, own_times
 
 SLACK_NS = 5 * NS
 """Largest difference between sampling time and log time for which a window is complete."""
@@ -105,8 +105,8 @@ class JointReader:
         """
         self._path, self._topics, self._clock, self._warn = path, topics, clock, warn
         self._chain = chain
-        self._offsets: dict[str, Series] = {}
-        self._trajectories: dict[str, list[Trajectory]] = {}
+        self._offsets: dict[str, JointSeries] = {}
+        self._trajectories: dict[str, list[JointTrajectory]] = {}
 
     def read(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window
@@ -255,9 +255,9 @@ class JointReader:
         self,
         topic: str,
         messages: Mapping[str, Messages],
-        stamped: Sequence[Series],
+        stamped: Sequence[JointSeries],
         window_ns: Window,
-    ) -> Series:
+    ) -> JointSeries:
         """Return the offsets of a topic from before the first stamp on; may be overwritten."""
         if topic in self._offsets:
             return _copied(self._offsets[topic])
@@ -313,7 +313,7 @@ class JointReader:
         field: str,
         messages: Mapping[str, Messages],
         window_ns: Window = (None, None),
-    ) -> Series:
+    ) -> JointSeries:
         """Return one field of a topic at message stamps on the log's clock."""
         source, kind = self._source(name)
         rows = self._rows(name, field, messages)
@@ -321,7 +321,7 @@ class JointReader:
             raise MissingChannelError(
                 self._path, f"{field} in {name}", self._filled(source, kind, window_ns)
             )
-        return Series(*merge_rows(rows, name, field, self._warn))
+        return JointSeries(*merge_rows(rows, name, field, self._warn))
 
     def _rows(self, name: str, field: str, found: Mapping[str, Messages]) -> list[JointRows]:
         """Return one field of a topic, with stamps on the log's clock."""
@@ -351,7 +351,7 @@ class JointReader:
             )
         return [JointRows(names, t_ns, t_ns, values) for names, t_ns, values in found]
 
-    def _read_trajectories(self, topic: str) -> list[Trajectory]:
+    def _read_trajectories(self, topic: str) -> list[JointTrajectory]:
         if topic not in self._trajectories:
             warn = self._warn
             messages = self._topics.raw(topic)
@@ -363,7 +363,7 @@ class JointReader:
     def _signals(
         self,
         key: tuple[str, str],
-        series: Series,
+        series: JointSeries,
         times: Sequence[IntArray],
         cuts: Mapping[int, tuple[slice, IntArray]],
     ) -> JointSignals:
@@ -437,5 +437,5 @@ class JointReader:
         return JointRows(row.names, row.stamp_ns + shift_ns, row.log_ns, row.values)
 
 
-def _copied(series: Series) -> Series:
-    return Series(series.names, series.t_ns, [values.copy() for values in series.values])
+def _copied(series: JointSeries) -> JointSeries:
+    return JointSeries(series.names, series.t_ns, [values.copy() for values in series.values])

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ...robot.model import Robot
-    from ...robot.run import Run
+    from ...robot.run import TwinRun
 
 DESCRIPTION = "robot.toml"
 """Attachment that describes the robot."""
@@ -108,7 +108,7 @@ class OpenLog:
         return name, robot
 
     @cached_property
-    def run(self) -> Run | None:
+    def run(self) -> TwinRun | None:
         """Servos, contact and physics rate of a twin's run; None for other sessions."""
         from ...robot.run import RUN_RECORD, run_from_record, run_from_scenario
 
@@ -217,7 +217,7 @@ def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"), copy=False)
 
 
-class SessionFacts:
+class ViewedSession:
     """The facts of a session, which hold for each of its views."""
 
     def __init__(self, log: OpenLog) -> None:
@@ -296,7 +296,7 @@ class SessionFacts:
         return None if given is None else given[0]
 
     @property
-    def run(self) -> Run | None:
+    def run(self) -> TwinRun | None:
         """Servos, contact and physics rate of a twin's run; None for other sessions."""
         return self._log.run
 

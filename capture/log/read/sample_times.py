@@ -274,7 +274,7 @@ def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
 
 
 @dataclass(frozen=True)
-class Series:
+class JointSeries:
     """Samples of some joints.
 
     Attributes:
@@ -288,7 +288,7 @@ class Series:
     values: Sequence[FloatArray]
 
 
-def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]]:
+def own_times(stamped: Sequence[JointSeries], offsets: JointSeries) -> list[list[IntArray]]:
     """Return the sampling times of several series whose joints have the same offsets.
 
     Args:
@@ -317,7 +317,7 @@ def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]
     return found
 
 
-def _each_own(series: Series, offsets: Series) -> list[IntArray]:
+def _each_own(series: JointSeries, offsets: JointSeries) -> list[IntArray]:
     place = {name: j for j, name in enumerate(offsets.names)}
     return [
         moved(t_ns, offsets.t_ns[j], offsets.values[j])
@@ -353,7 +353,7 @@ def _steps(offset_s: FloatArray) -> IntArray:
     return steps.astype(np.int64)
 
 
-def _stamped_alike(series: Series, other: Series) -> bool:
+def _stamped_alike(series: JointSeries, other: JointSeries) -> bool:
     if series.names != other.names or len({id(t_ns) for t_ns in (*series.t_ns, *other.t_ns)}) > 2:
         return False
     return all(

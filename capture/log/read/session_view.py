@@ -17,7 +17,7 @@ from ..messages.definitions import MessageType
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .joint_messages import JointRows
 from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
-from .open_log import OpenLog, SessionFacts
+from .open_log import OpenLog, ViewedSession
 from .sample_times import JointSignals
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _Found = TypeVar("_Found")
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 
-class SessionView(SessionFacts):
+class SessionView(ViewedSession):
     """A session, or a view of it that reads through the same open file; see :meth:`view`.
 
     Functions that read a session accept either. Only the session itself can be closed.

@@ -5,7 +5,14 @@ import pytest
 from scipy.special import j0
 
 from undulog.analysis.body.motion import observed, perfect_tracking, place_links, track
-from undulog.analysis.body.null import SAMPLES, Chain, free_chain, one_cycle, places, viscous_chain
+from undulog.analysis.body.null import (
+    SAMPLES,
+    RigidChain,
+    free_chain,
+    one_cycle,
+    places,
+    viscous_chain,
+)
 from undulog.analysis.estimators.series import Series
 from undulog.capture import load_robot
 from undulog.capture.robot.kinematics import quaternion_from_rotation
@@ -43,7 +50,7 @@ def test_speed_of_the_viscous_slender_body(links, lag, a, stated):
     omega, ratio = 2.0, 10.0
     joint_amplitude = 2 * a * np.sin(lag / 2)
     one = np.ones(links)
-    chain = Chain(one, one, ratio * one, ratio * one / 12)
+    chain = RigidChain(one, one, ratio * one, ratio * one / 12)
     motion = one_cycle(chain, wave(links - 1, lag, joint_amplitude), np.zeros(links - 1), omega)
     speed = abs(motion.displacement) * omega / (2 * np.pi)
     beta = (1 - j0(2 * a)) / 2
@@ -89,7 +96,9 @@ def test_a_free_chain_keeps_its_momentum_at_zero():
 
 def test_two_free_links_share_the_turn_by_symmetry():
     one = np.ones(2)
-    motion = one_cycle(Chain(one, one, one, one / 12), np.array([[0.5 + 0j]]), np.zeros(1), 2.0)
+    motion = one_cycle(
+        RigidChain(one, one, one, one / 12), np.array([[0.5 + 0j]]), np.zeros(1), 2.0
+    )
     # Equal links turn by equal and opposite amounts: the head by minus half of the joint angle.
     swing = motion.heading - motion.heading[0]
     np.testing.assert_allclose(swing, -(motion.angles[:, 0] - motion.angles[0, 0]) / 2, atol=1e-12)

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import cholesky, inv
 
 from undulog.analysis.catalog import change_points, session_noise
-from undulog.analysis.catalog.change_points import Kind, find_change_points
+from undulog.analysis.catalog.change_points import DepartureKind, find_change_points
 from undulog.analysis.catalog.session_noise import (
     SessionNoise,
     centred,
@@ -124,9 +124,9 @@ def test_two_changes_and_an_outlier_of_one_joint_are_found_by_themselves():
     values[8, 4] -= 0.15
     points = judged(values).points
     assert sorted((p.joint, p.kind, p.session) for p in points) == [
-        (2, Kind.STEP, 20),
-        (2, Kind.STEP, 42),
-        (4, Kind.OUTLIER, 8),
+        (2, DepartureKind.STEP, 20),
+        (2, DepartureKind.STEP, 42),
+        (4, DepartureKind.OUTLIER, 8),
     ]
     for point, truth in zip(
         sorted(points, key=lambda p: p.session), (-0.15, 0.06, -0.09), strict=True
@@ -160,7 +160,7 @@ def test_a_single_session_far_off_near_the_end_is_no_change():
     values = 0.01 * ar1(9, 40, 6, 0.0)
     values[38, 3] += 0.5
     (point,) = judged(values).points
-    assert (point.joint, point.kind, point.session) == (3, Kind.OUTLIER, 38)
+    assert (point.joint, point.kind, point.session) == (3, DepartureKind.OUTLIER, 38)
 
 
 def test_tails_of_the_noise_are_estimated():

@@ -10,7 +10,7 @@ import pytest
 
 from support.linear_chain import CHAIN, WAVE, M, write_run
 from undulog.analysis.catalog.catalog import Catalog
-from undulog.analysis.catalog.change_points import Judged
+from undulog.analysis.catalog.change_points import JudgedQuantity
 from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
 pytestmark = pytest.mark.nightly
@@ -94,7 +94,7 @@ def without_changes(monkeypatch):
     """Look for no changes, which takes the rest."""
     monkeypatch.setattr(
         "undulog.analysis.catalog.fleet.find_change_points",
-        lambda series, *_: [Judged()] * len(series),
+        lambda series, *_: [JudgedQuantity()] * len(series),
     )
 
 

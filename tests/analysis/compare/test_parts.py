@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.body.travel import GRAVITY, Steps, centre_of_mass, cost_of_transport, speed
+from undulog.analysis.body.travel import (
+    GRAVITY,
+    CycleSteps,
+    centre_of_mass,
+    cost_of_transport,
+    speed,
+)
 from undulog.analysis.compare.quantities import Quantities
 from undulog.analysis.compare.side import changes, cycles_by_phase, phases_rad, turned
 from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.results.comparison import Change
+from undulog.analysis.results.comparison import MetadataChange
 from undulog.capture import load_robot
 from undulog.capture.robot.kinematics import quaternion_from_rotation
 
@@ -18,20 +24,20 @@ def test_changes_are_what_only_one_side_has_or_has_otherwise():
     a = [same | {"scenario.toml: world.ground.mu_normal": "0.5"}] * 2
     b = [same | {"scenario.toml: world.ground.mu_normal": v, "robot.toml: x": "1"} for v in "23"]
     assert changes(a, b) == (
-        Change("robot.toml: x", None, "1"),
-        Change("scenario.toml: world.ground.mu_normal", "0.5", "2, 3"),
+        MetadataChange("robot.toml: x", None, "1"),
+        MetadataChange("scenario.toml: world.ground.mu_normal", "0.5", "2, 3"),
     )
 
 
 def test_speed_and_cost_of_transport_of_even_steps():
-    steps = Steps(np.full(5, 0.2), cycle_s=2.0, mass_kg=3.0)
+    steps = CycleSteps(np.full(5, 0.2), cycle_s=2.0, mass_kg=3.0)
     assert speed(steps)[:2] == pytest.approx((0.1, 0.0))
     value, variance, dof = cost_of_transport(steps, np.full(5, 1.5))
     assert (value, variance, dof) == (pytest.approx(1.5 / (3.0 * GRAVITY * 0.2)), 0.0, 4.0)
 
 
 def test_nothing_is_carried_where_the_steps_are_noise():
-    steps = Steps(np.array([0.1, -0.11, 0.1, -0.08]), cycle_s=1.0, mass_kg=1.0)
+    steps = CycleSteps(np.array([0.1, -0.11, 0.1, -0.08]), cycle_s=1.0, mass_kg=1.0)
     assert cost_of_transport(steps, np.ones(4)) is None
 
 
@@ -40,7 +46,7 @@ def test_error_of_the_cost_of_transport_covers():
     rng = np.random.default_rng(0)
     truth, inside = 1.0 / (GRAVITY * 0.2), 0
     for _ in range(800):
-        steps = Steps(rng.normal(0.2, 0.01, 8), cycle_s=1.0, mass_kg=1.0)
+        steps = CycleSteps(rng.normal(0.2, 0.01, 8), cycle_s=1.0, mass_kg=1.0)
         value, variance, _ = cost_of_transport(steps, rng.normal(1.0, 0.03, 8))
         inside += abs(value - truth) < 2.365 * variance**0.5
     assert 0.925 < inside / 800 < 0.975

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from undulog.analysis.estimators.demodulation import (
-    Cycles,
-    Phase,
+    CycleResponses,
+    LoggedPhase,
     _amplitudes,
     _difference_dof,
     _holes,
@@ -72,7 +72,7 @@ def test_ratios_and_noise_of_runs_of_any_length_are_those_of_a_loop():
 def test_runs_whose_command_is_unknown_have_no_response():
     nothing = np.full(3, np.nan + 0j)
     found = cycles_of([np.arange(4.0)], [nothing], [np.ones(3) + 0j])
-    assert isinstance(found, Cycles)
+    assert isinstance(found, CycleResponses)
     assert np.isnan(found.ratio).all()
     still = cycles_of([np.arange(4.0)], [np.zeros(3) + 0j], [np.ones(3) + 0j])
     assert np.isnan(still.ratio).all()
@@ -84,7 +84,7 @@ def test_runs_whose_command_is_unknown_have_no_response():
 
 def wave(rate=50.0, seconds=8.0):
     t = np.arange(round(rate * seconds)) / rate
-    return t, Phase(t, 2 * np.pi * t + 0.2)
+    return t, LoggedPhase(t, 2 * np.pi * t + 0.2)
 
 
 def test_a_command_that_stands_has_no_amplitude():
@@ -111,7 +111,7 @@ def test_a_few_samples_within_the_phase_are_no_cycle(count):
 @pytest.mark.parametrize(("count", "there"), [(11, False), (12, True)])
 def test_each_cycle_needs_twelve_samples_of_its_own(count, there):
     _, phase = wave()
-    phase = Phase(phase.t_s, phase.value - 0.2)  # cycles begin at half seconds
+    phase = LoggedPhase(phase.t_s, phase.value - 0.2)  # cycles begin at half seconds
     t = (np.arange(8 * count) + 0.5) / count
     amplitude, explained = _amplitudes(
         Series("q", t, np.cos(2 * np.pi * t)), phase, phase.edges_s()
@@ -141,7 +141,7 @@ def test_a_second_harmonic_is_fitted_beside_the_first():
     """At uneven times they are not orthogonal."""
     rng = np.random.default_rng(6)
     t = np.cumsum(rng.uniform(0.02, 0.06, 300))
-    phase = Phase(np.array([0.0, 12.0]), np.array([0.0, 24 * np.pi]))
+    phase = LoggedPhase(np.array([0.0, 12.0]), np.array([0.0, 24 * np.pi]))
     angle = 2 * np.pi * t
     plain = Series("q", t, 0.4 * np.cos(angle + 1.0))
     edges = phase.edges_s()

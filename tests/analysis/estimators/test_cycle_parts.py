@@ -5,7 +5,7 @@ import pytest
 
 from undulog.analysis.estimators import demodulation
 from undulog.analysis.estimators.demodulation import (
-    Phase,
+    LoggedPhase,
     _amplitudes,
     _comb,
     _difference_dof,
@@ -48,7 +48,7 @@ def test_a_cycle_needs_six_samples():
 
 
 def test_a_phase_is_interpolated_and_ends_with_its_samples():
-    phase = Phase(np.array([0.0, 1.0, 3.0]), np.array([1.0, 3.0, 4.0]))
+    phase = LoggedPhase(np.array([0.0, 1.0, 3.0]), np.array([1.0, 3.0, 4.0]))
     np.testing.assert_allclose(phase.at(np.array([0.5, 2.0, 0.0, 3.0])), [2.0, 3.5, 1.0, 4.0])
     assert np.isnan(phase.at(np.array([-0.01, 3.01]))).all()
 
@@ -56,11 +56,11 @@ def test_a_phase_is_interpolated_and_ends_with_its_samples():
 def test_whole_cycles_but_for_rounding_count():
     t = np.arange(101.0)
     for turns, count in ((3.0 - 1e-7, 3), (3.0 - 1e-5, 2), (3.99, 3), (2.0, 2), (1.99, 0)):
-        edges = Phase(t, 2 * np.pi * turns * t / 100).edges_s()
+        edges = LoggedPhase(t, 2 * np.pi * turns * t / 100).edges_s()
         assert edges.size == count
     # Faster than a hundred cycles a sample it is no phase.
-    assert Phase(t[:3], 2 * np.pi * np.array([0.0, 150.0, 300.5])).edges_s().size == 300
-    assert Phase(t[:3], 2 * np.pi * np.array([0.0, 151.0, 302.5])).edges_s().size == 0
+    assert LoggedPhase(t[:3], 2 * np.pi * np.array([0.0, 150.0, 300.5])).edges_s().size == 300
+    assert LoggedPhase(t[:3], 2 * np.pi * np.array([0.0, 151.0, 302.5])).edges_s().size == 0
 
 
 def test_the_comb_is_the_mean_over_a_cycle_around():
@@ -137,7 +137,7 @@ def test_an_amplitude_is_least_squares_of_two_harmonics():
     t = np.arange(600) / 100
     phi = 2 * np.pi * t + 0.05 * np.sin(t)
     values = 0.5 * np.cos(phi + 0.4) + 0.2 * np.sin(2 * phi) + 0.05 * RNG.normal(size=600)
-    phase, series = Phase(t, phi), Series("q", t, values + 2.0)
+    phase, series = LoggedPhase(t, phi), Series("q", t, values + 2.0)
     edges = phase.edges_s()
     amplitude, explained = _amplitudes(series, phase, edges)
     swing = series.values[:-1] - _comb(phi[:-1], series.values[:-1])  # the last is the end
@@ -161,7 +161,7 @@ def test_an_amplitude_is_least_squares_of_two_harmonics():
 def test_a_cycle_of_a_command_needs_twelve_samples():
     for rate, there in ((12.0, True), (11.0, False)):
         t = np.arange(round(8 * rate) + 1) / rate + 1e-4
-        phase = Phase(t, 2 * np.pi * t)
+        phase = LoggedPhase(t, 2 * np.pi * t)
         amplitude, explained = _amplitudes(
             Series("q", t, np.cos(2 * np.pi * t)), phase, phase.edges_s()
         )
@@ -169,7 +169,7 @@ def test_a_cycle_of_a_command_needs_twelve_samples():
         assert (explained > 0.5).any() == there
     few = np.arange(12) / 10
     amplitude, explained = _amplitudes(
-        Series("q", few, few), Phase(few, 9 * few), np.array([0.4, 0.8])
+        Series("q", few, few), LoggedPhase(few, 9 * few), np.array([0.4, 0.8])
     )
     assert np.isnan(amplitude).all()
     assert explained.tolist() == [0.0]
@@ -177,7 +177,7 @@ def test_a_cycle_of_a_command_needs_twelve_samples():
 
 def test_a_command_counts_where_the_phase_explains_four_fifths():
     t = np.arange(2000) / 100 + 0.003
-    phase = Phase(t, 2 * np.pi * t)
+    phase = LoggedPhase(t, 2 * np.pi * t)
     edges = phase.edges_s()
     for share, there in ((0.81, True), (0.79, False)):
         # Of power 1 - share: a wave over which the mean of each cycle is zero.

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from support.written_topics import write_topics
 from undulog.analysis.estimators.demodulation import (
-    Phase,
+    LoggedPhase,
     _difference_dof,
     amplitudes,
     cycles_of,
@@ -35,7 +35,7 @@ def wave(omega, gain, lag, amplitude, offset=0.0):
 
 
 def cycles(phi, command, response, **options):
-    phase = Phase(T, phi)
+    phase = LoggedPhase(T, phi)
     edges = phase.edges_s()
     pair = demodulate(command, response, phase, edges)
     return cycles_of([edges], [pair[0]], [pair[1]], **options)
@@ -123,7 +123,7 @@ def test_a_phase_that_does_not_drive_the_command_gives_nothing():
 
 def test_too_few_cycles_have_no_interval():
     phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
-    phase = Phase(T[:800], phi[:800])
+    phase = LoggedPhase(T[:800], phi[:800])
     edges = phase.edges_s()
     pair = demodulate(command, Series("q", T, response), phase, edges)
     found = cycles_of([edges], [pair[0]], [pair[1]])
@@ -209,12 +209,12 @@ def test_the_noise_of_a_cycle_is_that_of_its_second_differences():
 
 def test_whole_cycles_have_half_of_one_around_them():
     t = np.arange(1001) / 100
-    phase = Phase(t, 0.3 + 2 * np.pi * 1.05 * t)
+    phase = LoggedPhase(t, 0.3 + 2 * np.pi * 1.05 * t)
     edges = phase.edges_s()
     # 10.5 turns: nine whole cycles, and half of one at either end.
     np.testing.assert_allclose(edges, (np.pi + 2 * np.pi * np.arange(10)) / (2 * np.pi * 1.05))
-    assert Phase(t[:100], 2 * np.pi * t[:100]).edges_s().size == 0
-    assert Phase(t[:2], np.array([0.0, 1e9])).edges_s().size == 0
+    assert LoggedPhase(t[:100], 2 * np.pi * t[:100]).edges_s().size == 0
+    assert LoggedPhase(t[:2], np.array([0.0, 1e9])).edges_s().size == 0
     np.testing.assert_allclose(
         phase.at(np.array([-1.0, 0.005, 11.0])), [np.nan, 0.3 + phase.value[1] / 2 - 0.15, np.nan]
     )

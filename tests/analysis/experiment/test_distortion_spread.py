@@ -9,7 +9,7 @@ from undulog.analysis.experiment.best_linear import (
     over_realisations,
     realisation_response,
 )
-from undulog.analysis.experiment.distortion_spread import Spread, distortion_spread
+from undulog.analysis.experiment.distortion_spread import LevelSpread, distortion_spread
 from undulog.analysis.response.nonparametric import line_power
 
 N, PERIODS = 256, 3
@@ -91,4 +91,4 @@ def test_of_more_realisations_the_spread_is_narrower():
         assert highs == sorted(highs, reverse=True)
         assert all(getattr(spread, which).low < 1 for spread in spreads)
     alone = distortion_spread(np.array([5]), np.ones(1), 4)
-    assert alone.excited == alone.odd == alone.even == Spread()
+    assert alone.excited == alone.odd == alone.even == LevelSpread()

@@ -8,7 +8,7 @@ from undulog.analysis.estimators.intervals import NoisyMatrix
 from undulog.analysis.experiment.kick_coupling import predict, valid_to
 from undulog.analysis.experiment.kick_runs import (
     Kick,
-    Kind,
+    KickKind,
     deviation_of,
     kick_of,
     missing_kicks,
@@ -45,7 +45,7 @@ def logarithms(H, command):
 def plan(m=M, size=0.05):
     return [
         Kick(j, kind, sign * size)
-        for kind in (Kind.PHASE, Kind.AMPLITUDE)
+        for kind in (KickKind.PHASE, KickKind.AMPLITUDE)
         for j in range(m)
         for sign in (1, -1)
     ]
@@ -53,7 +53,7 @@ def plan(m=M, size=0.05):
 
 def kicked(command, kick):
     off = np.zeros(len(command), dtype=complex)
-    off[kick.joint] = kick.size * (1j if kick.kind is Kind.PHASE else 1.0)
+    off[kick.joint] = kick.size * (1j if kick.kind is KickKind.PHASE else 1.0)
     return command * np.exp(off)
 
 
@@ -75,8 +75,8 @@ def noisy(rng, log, sigma):
 def measure(log, kicks, variance=0.0, dof=10.0):
     variances = np.broadcast_to(variance, (2, *log.shape))
     answers = ResponseMatrices(log, *variances, np.full(log.shape, dof))
-    P, R = central_differences(kicks, answers, Kind.PHASE)
-    S, G = central_differences(kicks, answers, Kind.AMPLITUDE)
+    P, R = central_differences(kicks, answers, KickKind.PHASE)
+    S, G = central_differences(kicks, answers, KickKind.AMPLITUDE)
     return P, R, G, S
 
 
@@ -253,7 +253,7 @@ def test_kicks_are_estimated_from_phasors():
         truth = kicks[order[k] - 2]
         assert (kick.joint, kick.kind) == (truth.joint, truth.kind)
         assert kick.size == pytest.approx(truth.size, abs=1e-12)
-    assert missing_kicks(list(found.kicks.values()), Kind.PHASE, NAMES) == ()
+    assert missing_kicks(list(found.kicks.values()), KickKind.PHASE, NAMES) == ()
 
 
 def test_what_is_no_kick():
@@ -267,9 +267,9 @@ def test_what_is_no_kick():
 def test_one_sided_kicks_are_refused():
     H, command = planted()
     kicks = [one for one in plan() if one.size > 0 or one.joint != 2]
-    assert missing_kicks(kicks, Kind.PHASE, NAMES) == ("waist only up",)
-    uneven = [Kick(0, Kind.PHASE, 0.05), Kick(0, Kind.PHASE, -0.03)]
-    missing = missing_kicks(uneven, Kind.PHASE, NAMES)
+    assert missing_kicks(kicks, KickKind.PHASE, NAMES) == ("waist only up",)
+    uneven = [Kick(0, KickKind.PHASE, 0.05), Kick(0, KickKind.PHASE, -0.03)]
+    missing = missing_kicks(uneven, KickKind.PHASE, NAMES)
     assert missing[:2] == ("head by +0.050 and -0.030", "neck not at all")
     log = run_all(lambda c: H @ c, command, kicks)
     with pytest.raises(UsageError, match=r"joint 3 of 5: .* not kicked both up and down"):

@@ -10,7 +10,7 @@ import pytest
 from support.kick_runs import kicked
 from undulog.analysis.experiment.answer import kick_answer
 from undulog.analysis.experiment.kick_coupling import kick_coupling
-from undulog.analysis.experiment.kick_runs import Kick, Kind, sort_kicks
+from undulog.analysis.experiment.kick_runs import Kick, KickKind, sort_kicks
 from undulog.analysis.experiment.local_coupling import local_matrices
 from undulog.analysis.experiment.run_scatter import run_errors
 
@@ -166,7 +166,7 @@ def test_curved_answers_are_stated():
     experiment = runs(np.random.default_rng(9), 0.0)
     bent = experiment.ratio.copy()
     for k, kick in enumerate(KICKS):
-        if kick is not None and kick.kind is Kind.PHASE:
+        if kick is not None and kick.kind is KickKind.PHASE:
             bent[k] *= np.exp(8j * kick.size**2)
     coupling = coupled(dataclasses.replace(experiment, ratio=bent))
     assert coupling.kick_size.verdict == "too large"
@@ -175,7 +175,7 @@ def test_curved_answers_are_stated():
 
 @pytest.mark.parametrize("size", [0.004, 0.3])
 def test_kicks_of_unusual_size_are_found(size):
-    kicks = [Kick(j, Kind.PHASE, s * size) for j in range(5) for s in (1, -1)]
+    kicks = [Kick(j, KickKind.PHASE, s * size) for j in range(5) for s in (1, -1)]
     off = np.zeros((11, 5), dtype=complex)
     for k, kick in enumerate(kicks, start=1):
         off[k, kick.joint] = 1j * kick.size

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.joint_runs import turns, write_joints
-from undulog.analysis.experiment.kick_runs import Kind, missing_kicks, sort_kicks
+from undulog.analysis.experiment.kick_runs import KickKind, missing_kicks, sort_kicks
 from undulog.analysis.plan.designs import reversal, slowest_mode, tones, transverse_mass
 from undulog.capture import Session, load_robot
 from undulog.capture.robot.description import parse_robot
@@ -54,7 +54,7 @@ def test_kicks_read_back_as_kicks(like, tmp_path, report_of):
     command = np.stack([one[0][0, YAW] for one in found])
     runs = sort_kicks(command)
     assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (6, 16, 3)
-    for kind in Kind:
+    for kind in KickKind:
         assert missing_kicks(list(runs.kicks.values()), kind, "abcd") == ()
     np.testing.assert_allclose(np.abs(command[runs.base[0]]), 0.3, rtol=1e-5)
     for k, kick in runs.kicks.items():

@@ -11,14 +11,14 @@ from undulog.analysis import Estimate
 from undulog.analysis.present.oscillators import entrainment_entries
 from undulog.analysis.present.page import render
 from undulog.analysis.present.session_view import chain_view
-from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
+from undulog.analysis.results.oscillators import ChainCoupling, OscillatorLink, Rate
 
 pytestmark = pytest.mark.slow
 
 LINKS = (
-    Link("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6))),
-    Link("b", "a", Estimate(0.01, (0.0, 0.06)), Estimate()),
-    Link("b", "c", Estimate(3.0, (2.9, 3.1)), Estimate(-0.5, (-0.6, -0.4))),
+    OscillatorLink("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6))),
+    OscillatorLink("b", "a", Estimate(0.01, (0.0, 0.06)), Estimate()),
+    OscillatorLink("b", "c", Estimate(3.0, (2.9, 3.1)), Estimate(-0.5, (-0.6, -0.4))),
 )
 RATES = tuple(Rate(name, Estimate(3.1, (3.0, 3.2)), Estimate(), 2e-7) for name in "abc")
 CHAIN = ChainCoupling(

@@ -11,7 +11,7 @@ import pytest
 from undulog.analysis import Choices, Estimate, Experiment, compare_sessions, load
 from undulog.analysis.results.answer import Artefact
 from undulog.analysis.results.coupling import Route
-from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
+from undulog.analysis.results.oscillators import ChainCoupling, OscillatorLink, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 
@@ -113,7 +113,7 @@ def test_artefacts_are_one_row_a_stretch_and_oscillators_one_row_a_link(snake, k
         Artefact("joint01", "/joint_states", "position", "gaps", ((1.0, 1.5), (3.0, 3.2))),
         Artefact("joint02", "/joint_states", "effort", "wrong_sign", ()),
     )
-    link = Link("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6)))
+    link = OscillatorLink("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6)))
     rate = Rate("a", Estimate(3.1, (3.0, 3.2)), Estimate(), 1e-3)
     facts = ("vertical", True, "kicked", None, 40.0, 11, 60.0, 1)
     chain = ChainCoupling(*facts, links=(link,), oscillators=(rate,))

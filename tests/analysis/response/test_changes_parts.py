@@ -17,7 +17,7 @@ from undulog.analysis.response.changes import (
     _KEPT,
     _POWER,
     _SPREAD,
-    Cycles,
+    CycleRatios,
     ResponseChanges,
     _amplitude_drift,
     _blocks,
@@ -323,7 +323,7 @@ def test_commands_that_grow_have_a_regression_line():
     number = np.r_[np.arange(6.0), np.arange(8.0, 15.0)]
     scatter = 1e-4 * RNG.normal(size=(2, 13))
     size = np.exp(0.002 * (number - 7) + scatter)
-    cycles = Cycles(number, size * np.exp(0.3j), size, np.zeros(2))
+    cycles = CycleRatios(number, size * np.exp(0.3j), size, np.zeros(2))
     result = _amplitude_drift(cycles)
     lines = [stats.linregress(number, np.log(row)) for row in size]
     assert result.value == pytest.approx(np.mean([line.slope for line in lines]))
@@ -332,9 +332,11 @@ def test_commands_that_grow_have_a_regression_line():
     assert result.ci95 == pytest.approx((common.slope - half, common.slope + half))
     for drift, moving in ((1.1e-3 / 14, True), (0.9e-3 / 14, False)):
         size = np.exp(drift * (number - number.mean())) * np.ones((2, 1))
-        assert (_amplitude_drift(Cycles(number, size, size, np.zeros(2))) is not None) is moving
+        assert (
+            _amplitude_drift(CycleRatios(number, size, size, np.zeros(2))) is not None
+        ) is moving
     noisy = np.exp(0.1 * RNG.normal(size=(2, 13)))
-    assert _amplitude_drift(Cycles(number, noisy, noisy, np.zeros(2))) is None
+    assert _amplitude_drift(CycleRatios(number, noisy, noisy, np.zeros(2))) is None
 
 
 def test_a_phase_bends_by_polynomials_of_rising_degree():

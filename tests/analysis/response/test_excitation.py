@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.excitation import Kind, find_excitation
+from undulog.analysis.response.excitation import ExcitationKind, find_excitation
 
 T = np.arange(0.0, 60.0, 0.01)
 RNG = np.random.default_rng(0)
@@ -27,19 +27,19 @@ def multisine(period):
 @pytest.mark.parametrize(
     ("kind", "values"),
     [
-        (Kind.TONES, sines(0.25, 0.4, 0.613)),
-        (Kind.TONES, sines(0.25)),
-        (Kind.PERIODIC, multisine(12.0)),
-        (Kind.CHIRP, signal.chirp(T, 0.2, 60.0, 6.0)),
-        (Kind.CHIRP, signal.chirp(T, 6.0, 60.0, 0.2, method="logarithmic")),
-        (Kind.STEPS, np.sign(RNG.normal(size=120)).repeat(50)),
-        (Kind.NOISE, signal.lfilter(*signal.butter(2, 0.1), RNG.normal(size=T.size))),
+        (ExcitationKind.TONES, sines(0.25, 0.4, 0.613)),
+        (ExcitationKind.TONES, sines(0.25)),
+        (ExcitationKind.PERIODIC, multisine(12.0)),
+        (ExcitationKind.CHIRP, signal.chirp(T, 0.2, 60.0, 6.0)),
+        (ExcitationKind.CHIRP, signal.chirp(T, 6.0, 60.0, 0.2, method="logarithmic")),
+        (ExcitationKind.STEPS, np.sign(RNG.normal(size=120)).repeat(50)),
+        (ExcitationKind.NOISE, signal.lfilter(*signal.butter(2, 0.1), RNG.normal(size=T.size))),
     ],
 )
 def test_each_kind_is_found(kind, values):
     excitation = find_excitation(Series("u", T, values))
     assert excitation.kind is kind
-    if kind is Kind.PERIODIC:
+    if kind is ExcitationKind.PERIODIC:
         assert excitation.period_s == pytest.approx(12.0, abs=0.005)
 
 
@@ -59,7 +59,7 @@ def test_a_binary_sequence_that_repeats_is_periodic(chip, count):
     once = np.repeat(signal.max_len_seq(6)[0] * 2.0 - 1, chip)
     values = np.tile(once, 5)[: int(count * once.size)]
     excitation = find_excitation(Series("u", np.arange(values.size) * 0.01, values))
-    assert excitation.kind is Kind.PERIODIC
+    assert excitation.kind is ExcitationKind.PERIODIC
     assert excitation.period_s == pytest.approx(once.size * 0.01, rel=1e-9)
 
 
@@ -67,7 +67,7 @@ def test_a_period_may_end_between_two_samples():
     lines, period_s, t = np.arange(1, 60, 2), 7.8937, np.arange(0.0, 40.0, 0.02)
     turns = 2 * np.pi * np.outer(t, lines) / period_s + 6.28 * RNG.random(lines.size)
     excitation = find_excitation(Series("u", t, np.cos(turns).sum(axis=1)))
-    assert excitation.kind is Kind.PERIODIC
+    assert excitation.kind is ExcitationKind.PERIODIC
     assert excitation.period_s == pytest.approx(period_s, rel=1e-6)
 
 
@@ -78,5 +78,5 @@ def test_a_strong_line_is_not_taken_for_the_period():
     for line in (3, 7, 11, 16):
         values = values + 0.04 * np.cos(2 * np.pi * line * t / period_s + line)
     excitation = find_excitation(Series("u", t, values))
-    assert excitation.kind is Kind.PERIODIC
+    assert excitation.kind is ExcitationKind.PERIODIC
     assert excitation.period_s == pytest.approx(period_s, rel=1e-6)

@@ -11,7 +11,7 @@ from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.delay_model import DelayModel
 from undulog.analysis.response.excitation import (
     Excitation,
-    Kind,
+    ExcitationKind,
     _exact_lag,
     _is_chirp,
     _minima,
@@ -104,14 +104,14 @@ def test_a_command_has_to_move_often_and_without_long_gaps():
 
 
 def test_steps_have_at_most_eight_values():
-    for count, kind in ((8, Kind.STEPS), (9, Kind.NOISE)):
+    for count, kind in ((8, ExcitationKind.STEPS), (9, ExcitationKind.NOISE)):
         steps = RNG.permutation(np.repeat(np.arange(count), 20))[:100].repeat(20)
         assert find_excitation(series(steps)).kind is kind
 
 
 def test_one_sine_is_no_periodic_multisine():
     result = find_excitation(series(np.sin(2 * np.pi * T)))
-    assert (result.kind, result.tones_hz.size) == (Kind.TONES, 1)
+    assert (result.kind, result.tones_hz.size) == (ExcitationKind.TONES, 1)
     assert np.isnan(result.period_s)
 
 
@@ -211,7 +211,7 @@ def test_halves_are_those_of_the_record():
     u = np.cos(2 * np.pi * np.outer(T, tones)).sum(axis=1)
     gain = np.where(T < 20.0, 0.8, 0.5)
     pair = [series(u), series(gain * u + 1e-3 * RNG.normal(size=2000))]
-    excitation = Excitation(Kind.TONES, tones, float("nan"))
+    excitation = Excitation(ExcitationKind.TONES, tones, float("nan"))
     whole, first, second = _estimates(pair, excitation)
     np.testing.assert_allclose(np.abs(first.value), 0.8, atol=0.01)
     np.testing.assert_allclose(np.abs(second.value), 0.5, atol=0.01)
@@ -227,7 +227,7 @@ def test_halves_are_those_of_the_record():
 def test_a_band_needs_samples_of_all():
     u = RNG.normal(size=2000)
     short = series(RNG.normal(size=16), T[:16])
-    excitation = Excitation(Kind.NOISE, np.zeros(0), float("nan"))
+    excitation = Excitation(ExcitationKind.NOISE, np.zeros(0), float("nan"))
     assert list(_estimates([series(u), short], excitation)) == [None, None, None]
     halves = list(_estimates([series(u), series(2 * u)], excitation))
     assert [row is not None for row in halves] == [True] * 3
@@ -352,11 +352,11 @@ def test_distortion_is_power_where_the_command_has_none():
     excited, free = np.array([1, 3, 5, 9]), np.array([2, 4, 6, 7, 8])
     u = np.cos(2 * np.pi * np.outer(t, excited) / period_s + excited**2).sum(axis=1)
     y = 0.5 * u + 0.03 * np.cos(2 * np.pi * 4 * t / period_s) + 0.04 * np.cos(2 * np.pi * 7 * t / 4)
-    excitation = Excitation(Kind.PERIODIC, np.zeros(0), period_s)
+    excitation = Excitation(ExcitationKind.PERIODIC, np.zeros(0), period_s)
     pair = series(u, t), series(y, t)
     expected = np.sqrt((0.03**2 + 0.04**2) / free.size / 0.25)
     assert _distortion(*pair, excitation) == pytest.approx(expected, rel=1e-3)
-    assert _distortion(*pair, Excitation(Kind.NOISE, np.zeros(0), float("nan"))) is None
+    assert _distortion(*pair, Excitation(ExcitationKind.NOISE, np.zeros(0), float("nan"))) is None
     two = tuple(row.between(0.0, 8.01) for row in pair)
     assert _distortion(*two, excitation) == pytest.approx(expected, rel=0.01)
     less = tuple(row.between(0.0, 7.9) for row in pair)

@@ -7,7 +7,7 @@ from typing import Annotated
 import pytest
 
 from undulog.capture.common.config import Key, Name, NonNegative, Positive, read, write
-from undulog.capture.common.strict_table import Faults, Table, at_least, at_most
+from undulog.capture.common.strict_table import Faults, StrictTable, at_least, at_most
 
 
 class Colour(StrEnum):
@@ -39,7 +39,7 @@ class Whole:
 
 def given(values):
     faults = Faults()
-    return read(Table(values, "", faults), Whole), [str(fault) for fault in faults.all()]
+    return read(StrictTable(values, "", faults), Whole), [str(fault) for fault in faults.all()]
 
 
 WHOLE = {"name": "a", "part": {"size": 2}, "from": [1, 2]}

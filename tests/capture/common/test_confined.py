@@ -14,7 +14,7 @@ import pytest
 from support import confined_parsers
 from support.processes import python_started, wait_for
 from undulog.capture.common import confined
-from undulog.capture.common.confined import Confined, Limits
+from undulog.capture.common.confined import Confined, ParserLimits
 from undulog.capture.common.errors import (
     ImportFormatError,
     MissingChannelError,
@@ -213,7 +213,7 @@ def test_a_file_that_a_parser_writes_has_a_bound(reader, path, tmp_path):
 
 
 def test_the_limits_grow_with_the_file():
-    small, large = Limits.of(1000), Limits.of(5 << 30)
+    small, large = ParserLimits.of(1000), ParserLimits.of(5 << 30)
     assert (small.memory >> 20, small.cpu_s) == (640, 15)
     assert large.memory > 5 << 30
     assert large.cpu_s > 3600

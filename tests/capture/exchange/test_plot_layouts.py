@@ -15,8 +15,8 @@ from support.written_sessions import joint_state, write_foreign
 from support.written_topics import write_topics
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.exchange.plot_layouts import (
-    Curve,
     JointPlot,
+    TopicCurve,
     export_foxglove_layout,
     export_plotjuggler_layout,
     foxglove_layout,
@@ -126,7 +126,7 @@ def test_odd_names_and_topics(tmp_path):
 
 @given(st.integers(1, 40))
 def test_panels_share_the_height_of_a_tab(count):
-    curve = Curve("/joint_states", 0, "#000000", 0.0, 1.0)
+    curve = TopicCurve("/joint_states", 0, "#000000", 0.0, 1.0)
     layout = foxglove_layout([JointPlot(f"j{k}", (curve,)) for k in range(count)])
     for tab in layout["configById"]["Tab!joints"]["tabs"]:
         height, shares, tree = 100.0, [], tab["layout"]

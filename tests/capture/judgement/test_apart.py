@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 T_S = np.arange(0.0, 40.0, 0.02)
 GAIN, LAG_S = np.array([1.0, 0.9, 0.95, 1.0, 0.97]), np.array([0.10, 0.13, 0.11, 0.12, 0.10])
@@ -20,7 +20,7 @@ def arm(gain=GAIN, lag_s=LAG_S, noise=1e-3):
         return slow + 0.2 * np.sin(2 * np.pi * 2.3 * frequency[k] * t_s + k)
 
     return [
-        JointMotion(
+        RecordedJoint(
             f"j{k}",
             Samples(T_S, wave(T_S, k)),
             Samples(T_S, gain[k] * wave(T_S - lag_s[k], k) + rng.normal(0, noise, T_S.size)),

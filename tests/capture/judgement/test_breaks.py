@@ -6,7 +6,7 @@ import pytest
 from undulog.capture.judgement.blocks import TERMS, moments_of
 from undulog.capture.judgement.breaks import breaks_of
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 BLOCKS, WIDTH = 30, 40
 
@@ -98,7 +98,9 @@ def work(*, gain=0.0, offset=0.0, late_s=0.0, from_s=37.0, joints=3, seed=0):
         # It rests where friction lets it.
         rest = np.interp(T, MOVES_S, rng.normal(scale=0.006, size=len(MOVES_S)))
         noise = rng.normal(scale=0.001, size=T.size)
-        found.append(JointMotion(f"j{k}", Samples(T, path(T)), Samples(T, position + rest + noise)))
+        found.append(
+            RecordedJoint(f"j{k}", Samples(T, path(T)), Samples(T, position + rest + noise))
+        )
     return found
 
 

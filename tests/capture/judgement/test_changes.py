@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 T = np.arange(0.0, 100.0, 0.03)
 DEGREE = np.pi / 180
@@ -19,7 +19,7 @@ def joints(count, *, offset=0.0, gain=0.0, late_s=0.0, from_s=78.0):
         position = 0.3 * (1 + gain * own) * np.sin(angle) + offset * own
         command = Samples(T, 0.3 * np.sin(2 * np.pi * 0.27 * T - 0.7 * k))
         noise = 0.004 * rng.normal(size=T.size)
-        found.append(JointMotion(f"j{k}", command, Samples(T, position + noise)))
+        found.append(RecordedJoint(f"j{k}", command, Samples(T, position + noise)))
     return found
 
 
@@ -60,7 +60,7 @@ def test_a_vibration_of_one_half_of_ordinary_work_is_a_line(half):
         if k == 1:
             shakes = T < 50 if half == "first" else T >= 50
             position += 0.05 * np.sin(2 * np.pi * 7.3 * T) * shakes
-        work.append(JointMotion(each.name, Samples(T, command), Samples(T, position)))
+        work.append(RecordedJoint(each.name, Samples(T, command), Samples(T, position)))
     (line,) = judge(work).extra
     assert line.joint == "j1"
     assert line.frequency_hz == pytest.approx(7.3, abs=0.05)

@@ -8,7 +8,7 @@ import pytest
 from undulog.capture.judgement.exposure import covered, window_ranges
 from undulog.capture.judgement.judge import judge
 from undulog.capture.judgement.levels import LARGEST_REST_RAD
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 T = np.arange(0.0, 30.0, 0.02)
 
@@ -20,7 +20,7 @@ def joints(amplitude_rad, still, noise_rad=0.001):
         command = amplitude_rad * np.sin(2 * np.pi * 0.7 * T - 0.5 * k)
         late = amplitude_rad * np.sin(2 * np.pi * 0.7 * (T - 0.05) - 0.5 * k)
         position = (0 if k in still else 1) * late + noise_rad * rng.normal(size=T.size)
-        found.append(JointMotion(f"j{k}", Samples(T, command), Samples(T, position)))
+        found.append(RecordedJoint(f"j{k}", Samples(T, command), Samples(T, position)))
     return found
 
 
@@ -75,7 +75,7 @@ def test_a_soft_joint_rests_off_and_is_not_accused():
         late = np.interp(T - 0.05, T, command)
         sag = np.radians(6.0) * ~moves * (k == 3)
         position = late - sag + 0.001 * rng.normal(size=T.size)
-        motions.append(JointMotion(f"j{k}", Samples(T, command), Samples(T, position)))
+        motions.append(RecordedJoint(f"j{k}", Samples(T, command), Samples(T, position)))
     judgement = judge(motions)
     assert judgement.faults == ()
     (rest,) = judgement.rests
@@ -90,7 +90,7 @@ def late_by_half_a_cycle():
         position = np.where(T < 0.5 / 1.2, np.sin(-0.5 * k), np.sin(phase - np.pi))
         noise = 0.001 * np.random.default_rng(k).normal(size=T.size)
         command = Samples(T, 0.15 * np.sin(phase))
-        found.append(JointMotion(f"j{k}", command, Samples(T, 0.12 * position + noise)))
+        found.append(RecordedJoint(f"j{k}", command, Samples(T, 0.12 * position + noise)))
     return found
 
 

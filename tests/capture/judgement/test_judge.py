@@ -5,7 +5,7 @@ import pytest
 
 from undulog.capture.judgement.fault import KINDS
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 RATE, LENGTH, OMEGA, GAIN, LAG, NOISE = 100.0, 15.0, 2 * np.pi * 0.83, 0.95, np.radians(10), 4e-3
 BROKEN = 3
@@ -35,7 +35,7 @@ class Chain:
             return Samples(self.t, values) if quantity is None or quantity in channels else None
 
         return [
-            JointMotion(
+            RecordedJoint(
                 f"j{k + 1}",
                 Samples(self.t, self.command[k]),
                 Samples(self.t, self.position[k]),
@@ -359,7 +359,7 @@ def test_a_slow_gait_rests_at_none_of_its_turns():
     t = np.arange(0, 60, 0.01)
     phase = 2 * np.pi * t / 7.5 - 0.5 * np.arange(6)[:, None]
     motions = [
-        JointMotion(f"j{k}", Samples(t, 0.6 * np.sin(x)), Samples(t, 0.5 * np.sin(x - 0.1)))
+        RecordedJoint(f"j{k}", Samples(t, 0.6 * np.sin(x)), Samples(t, 0.5 * np.sin(x - 0.1)))
         for k, x in enumerate(phase)
     ]
     assert judge(motions).rests == ()

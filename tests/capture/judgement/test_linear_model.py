@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from undulog.capture.judgement.judge import judge
-from undulog.capture.judgement.motion import JointMotion, Samples
+from undulog.capture.judgement.motion import RecordedJoint, Samples
 
 T = np.arange(0.0, 80.0, 0.01)
 SERVO = signal.TransferFunction([1.0], [1 / 12.0**2, 1 / 12.0, 1.0])
@@ -28,7 +28,7 @@ def response(command):
 
 def judged(command, *positions):
     motions = [
-        JointMotion(f"j{k + 1}", Samples(T, command), Samples(T, position))
+        RecordedJoint(f"j{k + 1}", Samples(T, command), Samples(T, position))
         for k, position in enumerate(positions)
     ]
     return {fault.joint: fault for fault in judge(motions).faults}

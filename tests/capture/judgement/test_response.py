@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from undulog.capture.judgement.response import Response, fit_response
+from undulog.capture.judgement.response import JointResponse, fit_response
 
 STEP = 0.02
 T = np.arange(0.0, 40.0, STEP)
@@ -43,7 +43,7 @@ def test_gain_offset_and_lag_are_those_of_the_servo(name, delay_s, constant_s):
     noise = 0.002 * np.random.default_rng(1).normal(size=T.size)
     position = 0.85 * servo(COMMANDS[name], delay_s, constant_s) + 0.04 + noise
     response = fit_response(COMMANDS[name], position, np.ones(T.size, bool), STEP)
-    truth = Response(1.0, 0.0, delay_s, constant_s, order=1)
+    truth = JointResponse(1.0, 0.0, delay_s, constant_s, order=1)
     if name == "sine":  # at one frequency a delay and a pole replace each other
         assert at(0.6, response) == pytest.approx(0.85 * at(0.6, truth), rel=0.01)
     else:

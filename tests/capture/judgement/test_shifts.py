@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.judgement.shifts import (
-    Noise,
+    ShiftNoise,
     _fitted,
     _runs,
     common_noise,
@@ -104,27 +104,27 @@ def test_the_noise_of_like_joints_is_known_as_well_as_they_agree(freedom):
     """Variances 3 d0 / chi2(d0) of 400 joints, each known with ten degrees of freedom."""
     rng = np.random.default_rng(5)
     variance = 3 * freedom / rng.chisquare(freedom, 400)
-    like = common_noise([Noise(v * rng.chisquare(10) / 10, 10) for v in variance])
+    like = common_noise([ShiftNoise(v * rng.chisquare(10) / 10, 10) for v in variance])
     assert 0.5 * freedom < like.freedom < 2 * freedom
     assert like.variance == pytest.approx(3, rel=0.15)
 
 
 def test_joints_of_one_noise_are_one():
     rng = np.random.default_rng(6)
-    like = common_noise([Noise(2 * rng.chisquare(10) / 10, 10) for _ in range(400)])
+    like = common_noise([ShiftNoise(2 * rng.chisquare(10) / 10, 10) for _ in range(400)])
     assert like.freedom > 60
     assert like.variance == pytest.approx(2, rel=0.05)
 
 
 def test_like_joints_tell_nothing_of_one_that_is_noisier_than_they():
     rng = np.random.default_rng(6)
-    others = [Noise(2 * rng.chisquare(10) / 10, 10) for _ in range(20)]
-    assert common_noise(others, Noise(4.0, 10)) == common_noise(others)
-    assert common_noise(others, Noise(20.0, 10)) == Noise(0.0, 0.0)
+    others = [ShiftNoise(2 * rng.chisquare(10) / 10, 10) for _ in range(20)]
+    assert common_noise(others, ShiftNoise(4.0, 10)) == common_noise(others)
+    assert common_noise(others, ShiftNoise(20.0, 10)) == ShiftNoise(0.0, 0.0)
 
 
 def test_too_few_joints_tell_nothing_of_the_noise_of_another():
-    assert common_noise([Noise(1.0, 10)] * 2) == Noise(0.0, 0.0)
+    assert common_noise([ShiftNoise(1.0, 10)] * 2) == ShiftNoise(0.0, 0.0)
 
 
 def test_a_step_among_like_joints_is_found_in_few_blocks():

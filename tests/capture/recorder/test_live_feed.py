@@ -135,7 +135,7 @@ FIELDS = st.lists(st.tuples(*NUMBERS, st.binary(max_size=300)), max_size=20)
 
 @given(FIELDS, st.integers(0, 2**64 - 1))
 def test_datagram_comes_back_as_it_was(fields, dropped):
-    head = live_wire.DatagramHead(live_wire.Kind.MESSAGES, len(fields), 7, dropped)
+    head = live_wire.DatagramHead(live_wire.DatagramKind.MESSAGES, len(fields), 7, dropped)
     data = live_wire.pack_datagram(head, map(live_wire.pack_message, fields))
     assert live_wire.read_head(data) == head
     assert live_wire.read_records(data) == [live_wire.LiveMessage(*field) for field in fields]
@@ -143,7 +143,7 @@ def test_datagram_comes_back_as_it_was(fields, dropped):
 
 @pytest.mark.parametrize("record", DEFINITIONS)
 def test_definition_comes_back_as_it_was(record):
-    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    head = live_wire.DatagramHead(live_wire.DatagramKind.DEFINITIONS, 0, 7, 0)
     data = live_wire.pack_datagram(head, [live_wire.pack_description(record)])
     assert live_wire.read_records(data) == [record]
 
@@ -156,7 +156,7 @@ def test_noise_is_refused_not_believed(noise):
 
 @given(st.data())
 def test_any_cut_or_flipped_datagram_is_read_or_refused(data):
-    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    head = live_wire.DatagramHead(live_wire.DatagramKind.DEFINITIONS, 0, 7, 0)
     whole = live_wire.pack_datagram(head, map(live_wire.pack_description, DEFINITIONS[:4]))
     at = data.draw(st.integers(24, len(whole) - 1))
     damaged = whole[:at]
@@ -185,7 +185,7 @@ def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(mak
     pump_until(feed, lambda: feed.connected)
     heads, records = received(link)
     assert records == DEFINITIONS
-    assert {head.kind for head in heads} == {live_wire.Kind.DEFINITIONS}
+    assert {head.kind for head in heads} == {live_wire.DatagramKind.DEFINITIONS}
     for number in range(100, 300):
         offer(feed, number)
     records = all_sent(feed, link)
@@ -327,7 +327,10 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
     assert numbers == sorted(numbers)
     assert numbers[-1] == 19_999
     assert len(numbers) + feed.counts.dropped == 20_000
-    assert live_wire.read_head(feed._pack(live_wire.Kind.END).data).dropped == feed.counts.dropped
+    assert (
+        live_wire.read_head(feed._pack(live_wire.DatagramKind.END).data).dropped
+        == feed.counts.dropped
+    )
 
 
 def test_a_relay_that_is_replaced_is_found_and_gets_everything(watched, listen, monkeypatch):
@@ -371,7 +374,7 @@ def test_the_end_is_sent(watched):
     assert not feed.connected
     heads, records = received(link)
     assert [message.sequence for message in messages(records)] == [0]
-    assert heads[-1].kind is live_wire.Kind.END
+    assert heads[-1].kind is live_wire.DatagramKind.END
     offer(feed, 1)
     feed.pump()
     assert not feed.connected

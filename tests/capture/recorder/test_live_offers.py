@@ -11,7 +11,7 @@ from mcap.records import Channel, Schema
 from undulog.capture.log.mcap.batch import MessageBatch
 from undulog.capture.log.mcap.chunk import BODY_AT
 from undulog.capture.recorder.live_feed import LiveFeed
-from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_head, read_records
+from undulog.capture.recorder.live_wire import DatagramKind, LiveMessage, read_head, read_records
 
 MS = 1_000_000
 SCHEMAS = [
@@ -136,7 +136,7 @@ def test_a_state_that_is_offered_to_a_relay_is_a_message_and_then_a_definition(s
     stage.now_ns += 2000 * MS
     stage.feed.pump()
     data = stage.link.recv(1 << 16)
-    assert (read_head(data).kind, read_head(data).messages) == (Kind.DEFINITIONS, 0)
+    assert (read_head(data).kind, read_head(data).messages) == (DatagramKind.DEFINITIONS, 0)
     assert read_records(data)[-1].payload == b"walk"
     assert stage.feed.counts.sent == 1
 

@@ -63,7 +63,9 @@ class Stage:
                 data = self.link.recv(live_wire.MAX_DATAGRAM)
                 head = live_wire.read_head(data)
                 counts.append(
-                    "definitions" if head.kind is live_wire.Kind.DEFINITIONS else head.messages
+                    "definitions"
+                    if head.kind is live_wire.DatagramKind.DEFINITIONS
+                    else head.messages
                 )
         return counts
 

@@ -16,7 +16,7 @@ from undulog.capture.recorder.live_wire import (
     MAX_MESSAGE,
     RECORD_SIZE,
     DatagramHead,
-    Kind,
+    DatagramKind,
     LiveDefinitions,
     LiveMessage,
     pack_datagram,
@@ -40,7 +40,7 @@ def record_of(kind, payload, channel=0, sequence=0, *times):
 
 
 def datagram(*records):
-    return pack_datagram(DatagramHead(Kind.MESSAGES, len(records), 5, 6), records)
+    return pack_datagram(DatagramHead(DatagramKind.MESSAGES, len(records), 5, 6), records)
 
 
 # -- the layout ------------------------------------------------------------------------------------
@@ -49,7 +49,7 @@ def datagram(*records):
 def test_sizes_are_those_of_the_layout():
     assert (HEAD_SIZE, RECORD_SIZE) == (struct.calcsize(HEAD), struct.calcsize(RECORD)) == (24, 36)
     assert (MAX_DATAGRAM, MAX_MESSAGE) == (65_536, 65_536 - 24 - 36)
-    assert [(kind.name, int(kind)) for kind in Kind] == [
+    assert [(kind.name, int(kind)) for kind in DatagramKind] == [
         ("MESSAGES", 0), ("DEFINITIONS", 1), ("END", 2),
     ]  # fmt: skip
 
@@ -57,7 +57,7 @@ def test_sizes_are_those_of_the_layout():
 def test_a_datagram_has_the_bytes_of_the_layout():
     body = pack_definition(SCHEMA)[1]
     data = pack_datagram(
-        DatagramHead(Kind.DEFINITIONS, 513, 2**64 - 2, 2**63 + 1),
+        DatagramHead(DatagramKind.DEFINITIONS, 513, 2**64 - 2, 2**63 + 1),
         [pack_message(MESSAGE), pack_description(SCHEMA)],
     )
     head = struct.pack(HEAD, b"ULIV", 1, 1, 513, 2**64 - 2, 2**63 + 1)
@@ -66,13 +66,13 @@ def test_a_datagram_has_the_bytes_of_the_layout():
     assert data[24 : 24 + 40] == message
     assert data[64:100] == record_of(Opcode.SCHEMA, zlib.compress(body))[:36]
     assert zlib.decompress(data[100:]) == body
-    assert read_head(data) == DatagramHead(Kind.DEFINITIONS, 513, 2**64 - 2, 2**63 + 1)
+    assert read_head(data) == DatagramHead(DatagramKind.DEFINITIONS, 513, 2**64 - 2, 2**63 + 1)
     assert read_records(data) == [LiveMessage(*MESSAGE), SCHEMA]
 
 
 def test_a_head_without_records_is_whole_and_any_less_is_none():
-    head = pack_datagram(DatagramHead(Kind.END, 0, 1, 2), [])
-    assert (read_head(head).kind, read_records(head)) == (Kind.END, [])
+    head = pack_datagram(DatagramHead(DatagramKind.END, 0, 1, 2), [])
+    assert (read_head(head).kind, read_records(head)) == (DatagramKind.END, [])
     for size in (23, 0):
         with pytest.raises(DataError, match=f"a datagram of {size} bytes is too short for the"):
             read_head(head[:size])
@@ -81,7 +81,7 @@ def test_a_head_without_records_is_whole_and_any_less_is_none():
 @pytest.mark.parametrize(("at", "value"), [(0, b"X"), (3, b"W"), (4, b"\0"), (4, b"\2"), (5, b"\3"),
                                            (5, b"\xff")])  # fmt: skip
 def test_another_magic_version_or_kind_is_refused(at, value):
-    head = pack_datagram(DatagramHead(Kind.MESSAGES, 0, 1, 2), [])
+    head = pack_datagram(DatagramHead(DatagramKind.MESSAGES, 0, 1, 2), [])
     with pytest.raises(DataError, match="not of this version's live feed"):
         read_head(head[:at] + value + head[at + 1 :])
 

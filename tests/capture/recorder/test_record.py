@@ -22,7 +22,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.health import LiveHealth
-from undulog.capture.recorder.recording import Recording
+from undulog.capture.recorder.recording import RunningRecording
 from undulog.capture.recorder.settings import resolve
 
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
@@ -141,7 +141,7 @@ def test_a_mistake_in_what_looks_on_does_not_end_the_recording(output, bus, monk
     frames, _ = polling(100)
     sender = threading.Thread(target=send, args=(bus, frames))
     sender.start()
-    report = Recording(settings, StopRequest()).run()
+    report = RunningRecording(settings, StopRequest()).run()
     sender.join()
     assert not report.ending.failed
     assert len(frames_of(output)) == len(frames)

@@ -15,7 +15,7 @@ from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.recorder import recording
-from undulog.capture.recorder.recording import Recording
+from undulog.capture.recorder.recording import RunningRecording
 from undulog.capture.recorder.settings import resolve
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import ClockDomain
@@ -80,7 +80,7 @@ class Stage:
             alive=lambda: None,
         )
         settings = resolve(words | given, {})
-        self.made.append(Recording(settings, StopRequest(), notifier=notifier))
+        self.made.append(RunningRecording(settings, StopRequest(), notifier=notifier))
         return self.made[-1]
 
 

@@ -14,7 +14,7 @@ from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.recorder import recording
-from undulog.capture.recorder.recording import Recording
+from undulog.capture.recorder.recording import RunningRecording
 from undulog.capture.recorder.settings import resolve
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import ClockDomain
@@ -64,7 +64,7 @@ class Stage:
         words = {"sources": tuple(f"{s.name}=unix:/x/{s.name}" for s in sources)}
         words |= {"output": self.folder / f"{name}.mcap", "floor": 0}
         words |= {"socket": self.folder / f"{name}.sock"}
-        return Recording(resolve(words | given, {}), StopRequest())
+        return RunningRecording(resolve(words | given, {}), StopRequest())
 
 
 class Free:

@@ -116,7 +116,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair):
 
 def test_frames_of_this_computer_are_marked():
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
-    batch = reader_thread.Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
+    batch = reader_thread.PacketBatch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
     assert frames_of(batch, [5, 6])["dir"].tolist() == [DIR_RX, DIR_TX]
 
 

@@ -21,7 +21,7 @@ from undulog.replay.calibrate.lack_of_fit import (
     step_of,
 )
 from undulog.replay.calibrate.least_squares import LeastSquares, deviations
-from undulog.replay.calibrate.recorded import Measured
+from undulog.replay.calibrate.recorded import MeasuredAngles
 
 SIGMA = 0.005
 OMEGA = 2 * np.pi
@@ -185,7 +185,7 @@ def test_sessions_that_ask_for_other_parameters_are_found():
 
 def test_joints_without_enough_cycles_are_tested_for_memory():
     rest = SIGMA * np.random.default_rng(7).standard_normal(200)
-    measured = Measured(("a",), (T[:200],), (rest,))
+    measured = MeasuredAngles(("a",), (T[:200],), (rest,))
     assert lack_of_fit(measured, [rest], [OMEGA], None).joints["a"].periodic_rad is None
     assert lack_of_fit(measured, [rest], [4 * OMEGA], None).joints["a"].periodic_rad is not None
 

@@ -7,8 +7,8 @@ import pytest
 
 from undulog.capture.robot.kinematics import link_poses
 from undulog.replay.draw.ensemble import DEGREES, body_frame, mean_cycles, pace_of
-from undulog.replay.samples.content import Places
-from undulog.replay.samples.timeline import Rhythm
+from undulog.replay.samples.content import BodyPlaces
+from undulog.replay.samples.timeline import LoggedRhythm
 from undulog.replay.samples.tracks import Track
 
 EPOCH_NS = 1_735_689_600_000_000_000
@@ -29,7 +29,7 @@ def chirp(t):
 def rhythm():
     """The chirp as logged at 100 Hz for 20 s, wrapped."""
     t = np.arange(2001) / 100
-    return Rhythm.from_phase(ns(t), np.angle(np.exp(1j * chirp(t))))
+    return LoggedRhythm.from_phase(ns(t), np.angle(np.exp(1j * chirp(t))))
 
 
 def pace(rhythm, analysis=None, **options):
@@ -80,7 +80,7 @@ def test_a_gap_costs_its_cycles_only(rhythm):
 
 def test_a_phase_that_runs_backwards_is_turned_round():
     t = np.arange(1001) / 100
-    rhythm = Rhythm.from_phase(ns(t), -2 * np.pi * 0.5 * t)
+    rhythm = LoggedRhythm.from_phase(ns(t), -2 * np.pi * 0.5 * t)
     found = mean_cycles([Track("a", ns(t), np.sin(2 * np.pi * 0.5 * t))], pace(rhythm))
     np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-6)
 
@@ -99,7 +99,7 @@ def steady(analysis):
 
 def test_the_analysed_window_is_averaged_where_there_is_a_gait(steady):
     t = np.arange(1001) / 100
-    rhythm = Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)
+    rhythm = LoggedRhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)
     swing = np.where(t < 4.0, 9.0, 1.0) * np.sin(2 * np.pi * 0.5 * t)  # a start, then the gait
     found = mean_cycles([Track("a", ns(t), swing)], pace(rhythm, steady(4.0)))
     assert found.cycles.tolist() == [3]
@@ -110,7 +110,7 @@ def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(steady):
     t = np.arange(1001) / 100
     wave = 2 * np.pi * 0.5 * t - 1.1
     command = Track("a", ns(t), 0.4 * np.cos(wave))
-    own = pace(None, steady(0.0), commanded=[command], places=Places(("a",), None))
+    own = pace(None, steady(0.0), commanded=[command], places=BodyPlaces(("a",), None))
     found = mean_cycles([command, Track("b", ns(t), 0.3 * np.cos(wave - 0.2))], own)
     np.testing.assert_allclose(found.of("a")[0], 0.4 * np.cos(PHASE), atol=1e-6)
     np.testing.assert_allclose(found.of("b")[0], 0.3 * np.cos(PHASE - 0.2), atol=1e-6)
@@ -119,7 +119,7 @@ def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(steady):
 
 def test_without_a_whole_cycle_there_is_none():
     t = np.arange(150) / 100
-    assert (pace(Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)), pace(None)) == (None, None)
+    assert (pace(LoggedRhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)), pace(None)) == (None, None)
 
 
 def test_the_frame_goes_along_with_the_body(snake25):

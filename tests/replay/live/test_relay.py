@@ -14,7 +14,7 @@ from support.written_topics import write_topics
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
 from undulog.capture.recorder.live_feed import spawn_relay
-from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
+from undulog.capture.recorder.live_wire import DatagramHead, DatagramKind, pack_datagram
 from undulog.replay.live.relay import SILENCE_S, Inbox, Relay
 
 
@@ -121,7 +121,7 @@ def test_noise_on_the_socket_is_counted_and_borne(stage):
         link.connect(str(stage.path))
         link.send(b"")
         link.send(b"not ours")
-        link.send(pack_datagram(DatagramHead(Kind.MESSAGES, 1, 1, 0), [b"\x05\0\0\0cut"]))
+        link.send(pack_datagram(DatagramHead(DatagramKind.MESSAGES, 1, 1, 0), [b"\x05\0\0\0cut"]))
     recorder.send_all()
     report = relay.finish()
     assert (report["unread"], report["sessions"]) == (3, ["made-for-tests"])
@@ -167,13 +167,13 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
 
         def end_has_come():
             kinds[:] = [one.head.kind for one in inbox._queue]
-            return Kind.END in kinds
+            return DatagramKind.END in kinds
 
         wait_for(end_has_come)
         taken = inbox.take()
         assert sum(one.head.messages for one in taken) + inbox.dropped == recorder.feed.counts.sent
         assert inbox.dropped > 0
-        assert taken[0].head.kind is Kind.DEFINITIONS
+        assert taken[0].head.kind is DatagramKind.DEFINITIONS
         assert sum(len(one.data) for one in taken) <= 150_000
 
 

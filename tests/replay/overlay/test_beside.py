@@ -23,7 +23,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.replay.overlay.layout import build_blueprint
 from undulog.replay.overlay.sessions import Align, align, convert, read_side, times_of
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
-from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
+from undulog.replay.samples.timeline import SESSION_TIME, LoggedRhythm
 
 pytestmark = pytest.mark.nightly
 
@@ -302,7 +302,7 @@ def test_a_phase_is_found_where_it_was_first_reached():
     """A gait at 1 Hz that rests from 2 s to 3 s, and is missing from 5 s to 6 s."""
     t = np.round(np.concatenate([np.arange(0, 5.005, 0.01), np.arange(6, 8.005, 0.01)]), 2)
     cycles = np.where(t < 2, t, np.where(t < 3, 2.0, t - 1.0))
-    rhythm = Rhythm(np.round(t * 1e9).astype(np.int64), cycles)
+    rhythm = LoggedRhythm(np.round(t * 1e9).astype(np.int64), cycles)
     wanted = np.array([-0.1, 0.0, 0.735, 2.0, 2.5, 3.9999, 4.0, 4.5, 5.0, 6.125, 7.0, 7.01, np.nan])
     found, known = times_of(rhythm, wanted)
     expected = [np.nan, 0.0, 0.735, 2.0, 3.5, 4.9999, 5.0, np.nan, 6.0, 7.125, 8.0, np.nan, np.nan]

@@ -262,7 +262,7 @@ def test_stretches_are_as_long_as_they_have_to_be(opened):
     assert spans[-1].stop_ns > 1 << 61
     brief = opened(("/joint_states", ("a",), t[:6], t[:6]))
     (whole,) = timeline.stretches(brief, {"/joint_states": ["position"]}, NS)
-    assert whole.span == timeline.Span()
+    assert whole.span == timeline.DrawnSpan()
     # A clock that jumps a year: a million stretches would be empty.
     year = opened(("/joint_states", ("a",), np.append(t, 3.2e7), np.append(t, 1.0)))
     length_ns = stretch_length_ns(year)
@@ -300,9 +300,9 @@ def test_too_many_topics_leave_out_strangers_and_too_many_joints_are_refused(ope
 
 
 def test_places_of_three_joints_are_head_middle_tail():
-    three = content.Places(("a", "b", "c"), None)
+    three = content.BodyPlaces(("a", "b", "c"), None)
     assert three.labelled == {"a": "head", "b": "middle", "c": "tail"}
-    assert content.Places(("a", "b"), None).labelled == {"a": "a", "b": "b"}
+    assert content.BodyPlaces(("a", "b"), None).labelled == {"a": "a", "b": "b"}
     assert content.line_title("a", "head") == "a head"
     assert content.line_title("joint01", "head") == "joint01 head"
     assert content.line_title("a", "a") == "a"

@@ -8,7 +8,7 @@ from undulog.capture.robot.model import Plane
 from undulog.replay.recording import write_recording
 from undulog.replay.samples import timeline as stretches
 from undulog.replay.samples.quantities import survey
-from undulog.replay.samples.timeline import Span
+from undulog.replay.samples.timeline import DrawnSpan
 
 START = 1_735_689_600_000_000_000
 DRAWN = {
@@ -108,7 +108,7 @@ def test_every_sample_is_in_one_stretch(session_file, monkeypatch):
 
 def test_a_span_is_half_open():
     t_ns = np.arange(10, dtype=np.int64)
-    assert (Span(2, 5).rows(t_ns), Span().rows(t_ns)) == (slice(2, 5), slice(0, 10))
+    assert (DrawnSpan(2, 5).rows(t_ns), DrawnSpan().rows(t_ns)) == (slice(2, 5), slice(0, 10))
 
 
 def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25, opened):

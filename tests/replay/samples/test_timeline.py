@@ -10,9 +10,9 @@ from undulog.replay.samples.timeline import (
     ROWS_PER_CHUNK,
     SESSION_TIME,
     STRETCH_NS,
-    Clock,
-    Rhythm,
-    Span,
+    DrawnSpan,
+    LoggedRhythm,
+    TimeColumns,
     stretch_length_ns,
 )
 
@@ -34,14 +34,14 @@ def gathered(clock, t_ns):
 
 def test_session_time_counts_nanoseconds_from_the_start():
     start = 1_735_689_600_000_000_007
-    found = gathered(Clock(start), start + T)
+    found = gathered(TimeColumns(start), start + T)
     assert list(found[SESSION_TIME].values()) == T.tolist()
     assert not found[GAIT_CYCLE]
 
 
 def test_every_row_is_in_exactly_one_chunk_and_in_order():
     t = np.arange(3 * ROWS_PER_CHUNK + 17, dtype=np.int64)
-    rows = [part for part, _ in Clock(0).rows(t)]
+    rows = [part for part, _ in TimeColumns(0).rows(t)]
     assert [i for part in rows for i in range(part.start, part.stop)] == list(range(len(t)))
 
 
@@ -49,33 +49,35 @@ def test_every_row_is_in_exactly_one_chunk_and_in_order():
 def test_a_cycle_is_a_second_whether_the_phase_was_wrapped_or_not(wrap):
     phase = 2 * np.pi * 0.5 * T / 1e9 + 0.3
     logged = np.angle(np.exp(1j * phase)) if wrap else phase
-    found = gathered(Clock(0, Rhythm.from_phase(T, logged)), T)
+    found = gathered(TimeColumns(0, LoggedRhythm.from_phase(T, logged)), T)
     cycles = np.array(list(found[GAIT_CYCLE].values())) / 1e9
     np.testing.assert_allclose(cycles, phase / (2 * np.pi), atol=1e-9)
 
 
 def test_a_phase_that_runs_backwards_counts_down():
-    rhythm = Rhythm.from_phase(T, -2 * np.pi * T / 1e9)
+    rhythm = LoggedRhythm.from_phase(T, -2 * np.pi * T / 1e9)
     np.testing.assert_allclose(rhythm.cycles, -T / 1e9, atol=1e-12)
 
 
 def test_rows_without_a_phase_are_on_session_time_only():
     phase = 2 * np.pi * T / 1e9
     logged = (T >= 1000 * MS) & ~((T > 2000 * MS) & (T < 2500 * MS))
-    found = gathered(Clock(0, Rhythm.from_phase(T[logged], phase[logged])), T)
+    found = gathered(TimeColumns(0, LoggedRhythm.from_phase(T[logged], phase[logged])), T)
     assert list(found[SESSION_TIME]) == list(range(len(T)))
     assert list(found[GAIT_CYCLE]) == np.flatnonzero(logged).tolist()
 
 
 def test_no_rows_make_no_chunks():
-    assert list(Clock(0).rows(T[:0])) == []
+    assert list(TimeColumns(0).rows(T[:0])) == []
 
 
 def test_rows_with_and_without_a_phase_are_chunks_of_their_own():
     t = np.arange(3 * ROWS_PER_CHUNK, dtype=np.int64)
     first, last = ROWS_PER_CHUNK + 5, 2 * ROWS_PER_CHUNK + 9
-    rhythm = Rhythm(t[first : last + 1], t[first : last + 1] / 1e9)
-    chunks = [(rows.start, rows.stop, len(columns)) for rows, columns in Clock(0, rhythm).rows(t)]
+    rhythm = LoggedRhythm(t[first : last + 1], t[first : last + 1] / 1e9)
+    chunks = [
+        (rows.start, rows.stop, len(columns)) for rows, columns in TimeColumns(0, rhythm).rows(t)
+    ]
     assert chunks == [
         (0, ROWS_PER_CHUNK, 1),
         (ROWS_PER_CHUNK, first, 1),
@@ -87,22 +89,22 @@ def test_rows_with_and_without_a_phase_are_chunks_of_their_own():
 
 def test_a_chunk_has_4096_rows():
     t = np.arange(10_000, dtype=np.int64)
-    parts = [(rows.start, rows.stop) for rows, _ in Clock(0).rows(t)]
+    parts = [(rows.start, rows.stop) for rows, _ in TimeColumns(0).rows(t)]
     assert parts == [(0, 4096), (4096, 8192), (8192, 10_000)]
 
 
 def test_a_cycle_is_rounded_to_its_nanosecond():
     t = np.arange(4, dtype=np.int64)
-    found = gathered(Clock(0, Rhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
+    found = gathered(TimeColumns(0, LoggedRhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
     assert list(found[GAIT_CYCLE].values()) == [0, 2, 2, 250_000_000]
 
 
 def test_a_span_without_bounds_holds_every_time():
     t_ns = np.array([-(1 << 62), 0, (1 << 62) - 1], dtype=np.int64)
-    assert Span().rows(t_ns) == slice(0, 3)
-    assert Span(stop_ns=0).rows(t_ns) == slice(0, 1)
-    assert Span(start_ns=0).rows(t_ns) == slice(1, 3)
-    assert Span().known_ns is None
+    assert DrawnSpan().rows(t_ns) == slice(0, 3)
+    assert DrawnSpan(stop_ns=0).rows(t_ns) == slice(0, 1)
+    assert DrawnSpan(start_ns=0).rows(t_ns) == slice(1, 3)
+    assert DrawnSpan().known_ns is None
 
 
 def session_of(count, messages=0, first=(), last=()):

@@ -10,7 +10,7 @@ from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, empty_frames
 from undulog.capture.robot.model import ClockDomain
 from undulog.sim.drive.loop import BusTick
 from undulog.sim.drive.motion import find_motion
-from undulog.sim.drive.outcome import DriveEnding, GateEvent, GateStep, Outcome, Phase
+from undulog.sim.drive.outcome import DriveEnding, GateEvent, GatePhase, GateStep, Outcome
 from undulog.sim.drive.over_bus import bus_plan
 from undulog.sim.drive.session import BusSession, _mount_of, stamped
 from undulog.sim.gait.contract import GaitTick
@@ -30,7 +30,9 @@ def frames(*rows, way=DIR_RX):
     return found
 
 
-def tick(number, phase=Phase.RUN, command=None, gait=None, *, received=(), sent=None, remarks=()):
+def tick(
+    number, phase=GatePhase.RUN, command=None, gait=None, *, received=(), sent=None, remarks=()
+):
     angles = None if command is None else np.full(25, command)
     demand = None if command is None else angles + 0.5
     step = GateStep(phase, angles, demand, gait, tuple(remarks))
@@ -73,12 +75,12 @@ def remarks_of(session):
 
 def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
     session = written(
-        tick(0, Phase.POSE),
-        tick(1, Phase.APPROACH, 0.1),
-        tick(2, Phase.RUN, 0.2, gait(1.0)),
-        tick(3, Phase.RUN, 0.3, gait(2.0, "turn", ("joint02",))),
-        tick(5, Phase.RUN, 0.4, gait(3.0, "turn", ("joint02", "joint03"))),
-        tick(6, Phase.DONE),
+        tick(0, GatePhase.POSE),
+        tick(1, GatePhase.APPROACH, 0.1),
+        tick(2, GatePhase.RUN, 0.2, gait(1.0)),
+        tick(3, GatePhase.RUN, 0.3, gait(2.0, "turn", ("joint02",))),
+        tick(5, GatePhase.RUN, 0.4, gait(3.0, "turn", ("joint02", "joint03"))),
+        tick(6, GatePhase.DONE),
     )
     commands = session.joints("/joint_commands").signal("joint07")
     np.testing.assert_allclose(commands.values, [0.1, 0.2, 0.3, 0.4])
@@ -111,7 +113,7 @@ def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
 
 
 def test_a_gait_without_values_has_a_mode_only(written):
-    session = written(tick(0, Phase.RUN, 0.0, gait(1.0)), names=())
+    session = written(tick(0, GatePhase.RUN, 0.0, gait(1.0)), names=())
     assert "/gait" not in session.channels
     assert [one.data for _, one in session.messages("/gait/mode")] == ["walk"]
 

@@ -10,7 +10,7 @@ from undulog.capture.robot.description import parse_robot
 from undulog.sim.drive.dry_run_gait import DemandTally, GatedGait, NotedGait
 from undulog.sim.drive.gate import Gate
 from undulog.sim.drive.limits import GateLimits
-from undulog.sim.drive.outcome import Phase
+from undulog.sim.drive.outcome import GatePhase
 from undulog.sim.gait.contract import GaitTick, Readings
 from undulog.sim.physics.ledger import JOINT_TERMS
 from undulog.sim.physics.sensing import JointSample
@@ -164,7 +164,7 @@ def test_before_the_gait_begins_the_gate_moves_and_says_its_phase():
     assert found.tally.joints()[0].greatest == -np.inf
     np.testing.assert_array_equal(inner.first, row(0.099))
     (begun,) = run(1)
-    assert (begun.mode, begun.values.tolist(), gate.phase) == ("walk", [1.0], Phase.RUN)
+    assert (begun.mode, begun.values.tolist(), gate.phase) == ("walk", [1.0], GatePhase.RUN)
     np.testing.assert_allclose(begun.command, row(0.099))
     texts = [remark.text for remark in found.fresh_remarks()]
     assert [text.split(",")[0] for text in texts] == [

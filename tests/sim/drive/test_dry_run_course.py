@@ -16,7 +16,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
 from undulog.sim import parse_scenario
-from undulog.sim.drive.dry_run import Verdict, dry_run, joint_table, nominal_world
+from undulog.sim.drive.dry_run import DryRunVerdict, dry_run, joint_table, nominal_world
 from undulog.sim.drive.dry_run_gait import JointDemand
 from undulog.sim.drive.motion import MotionSource
 from undulog.sim.gait.contract import GaitTick
@@ -67,7 +67,7 @@ def test_it_has_the_time_for_the_pose_and_the_longest_ramps_and_ends_with_the_ga
     driven, made = motion((0.002, 0.0, -0.001))
     path, told = tmp_path / "a.mcap", []
     run = dry_run(driven, output=path, on_time=told.append)
-    assert (run.verdict, run.complete, run.started) == (Verdict.CLAMPED, True, True)
+    assert (run.verdict, run.complete, run.started) == (DryRunVerdict.CLAMPED, True, True)
     assert (run.duration_s, run.scenario.duration_s) == (0.05, 0.05)
     assert told[-6:] == [k / 100 for k in range(6)]
     assert set(told[:-6]) == {0.0}  # until the pose is known
@@ -108,7 +108,7 @@ def test_it_is_stopped_at_the_next_tick_and_then_not_known(tmp_path):
             stop.signal = signal.SIGINT
 
     run = dry_run(driven, output=path, stop=stop, on_time=on_time)
-    assert (run.verdict, run.fault, run.started) == (Verdict.UNFINISHED, None, False)
+    assert (run.verdict, run.fault, run.started) == (DryRunVerdict.UNFINISHED, None, False)
     assert (run.duration_s, ticks) == (0.0, [0.0] * 3)  # on the way to the first pose
     assert np.isnan(run.joints[0].tracking_error)
     with Session.open(path) as session:
@@ -124,7 +124,7 @@ def test_a_fault_is_the_verdict_of_its_session(tmp_path):
     robot, path = dataclasses.replace(ROBOT, safety=strict), tmp_path / "a.mcap"
     driven, _ = motion((0.1, 0.0, 0.0), duration_s=5.0)
     run = dry_run(driven, robot=robot, output=path)
-    assert (run.verdict, run.fault.kind) == (Verdict.STOPS, "tracking")
+    assert (run.verdict, run.fault.kind) == (DryRunVerdict.STOPS, "tracking")
     assert not run.complete
     with Session.open(path) as session:
         assert session.verdict == "bad"
@@ -165,7 +165,7 @@ def test_limits_that_a_robot_lacks_do_not_hold_it_back():
     bare = dataclasses.replace(ROBOT, safety=Safety(max_rate=4.0))
     driven, _ = motion((0.5, 0.0, 0.0), robot=bare, duration_s=0.02)
     run = dry_run(driven)
-    assert run.verdict is Verdict.REFUSED
+    assert run.verdict is DryRunVerdict.REFUSED
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
     assert math.isnan(run.approach_s)
     assert math.isnan(run.joints[0].max_tracking_error)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from undulog.sim.drive.dry_run import DryRun, Verdict, joint_table, reported, summary_lines
+from undulog.sim.drive.dry_run import DryRun, DryRunVerdict, joint_table, reported, summary_lines
 from undulog.sim.drive.dry_run_gait import JointDemand
 from undulog.sim.drive.outcome import FaultKind, GateEvent, GateFault
 
@@ -56,12 +56,16 @@ def test_shares_are_of_the_limits():
 @pytest.mark.parametrize(
     ("more", "verdict", "fits"),
     [
-        ({"joints": (demand(),)}, Verdict.RUNS, True),
-        ({}, Verdict.CLAMPED, True),
-        ({"joints": (demand(),), "cut": ("joint01",)}, Verdict.CLAMPED, True),
-        ({"complete": False}, Verdict.UNFINISHED, False),
-        ({"complete": False, "fault": FAULT}, Verdict.STOPS, False),
-        ({"complete": False, "fault": FAULT, "missing": ("max_rate",)}, Verdict.REFUSED, False),
+        ({"joints": (demand(),)}, DryRunVerdict.RUNS, True),
+        ({}, DryRunVerdict.CLAMPED, True),
+        ({"joints": (demand(),), "cut": ("joint01",)}, DryRunVerdict.CLAMPED, True),
+        ({"complete": False}, DryRunVerdict.UNFINISHED, False),
+        ({"complete": False, "fault": FAULT}, DryRunVerdict.STOPS, False),
+        (
+            {"complete": False, "fault": FAULT, "missing": ("max_rate",)},
+            DryRunVerdict.REFUSED,
+            False,
+        ),
     ],
 )
 def test_the_verdict_is_the_worst_that_is_true(more, verdict, fits):

@@ -15,7 +15,7 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
-from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world, reported, summary_lines
+from undulog.sim.drive.dry_run import DryRunVerdict, dry_run, nominal_world, reported, summary_lines
 from undulog.sim.drive.motion import find_motion
 
 RATE_HZ = 100
@@ -71,7 +71,7 @@ def test_ranges_rates_and_accelerations_are_those_of_the_commands(waved, robot):
 
 def test_it_would_run_and_the_first_line_says_so(waved):
     _, run, _ = waved
-    assert (run.verdict, run.verdict.fit) == (Verdict.RUNS, True)
+    assert (run.verdict, run.verdict.fit) == (DryRunVerdict.RUNS, True)
     assert (run.duration_s, run.scenario.duration_s, run.missing, run.fault) == (1.5, 1.5, (), None)
     lines = list(summary_lines(run, WIDE))
     assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
@@ -153,7 +153,7 @@ def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path, opened):
     commands[20:, 2] = 0.3
     path = tmp_path / "twin.mcap"
     run = dry_run(recorded(tmp_path / "step.mcap", robot, commands), output=path)
-    assert (run.verdict, run.verdict.fit) == (Verdict.CLAMPED, True)
+    assert (run.verdict, run.verdict.fit) == (DryRunVerdict.CLAMPED, True)
     assert run.joints[2].rate == pytest.approx(30.0)
     steps = np.diff(opened(path).joints("/joint_commands").signal("joint03").values)
     assert steps.max() == pytest.approx(4.0 / RATE_HZ)  # of [safety] max_rate
@@ -174,7 +174,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
     joints[2] = dataclasses.replace(joints[2], servo=weak)
     world = dataclasses.replace(world, robot=dataclasses.replace(robot, joints=tuple(joints)))
     run = dry_run(driven, world=world)
-    assert (run.verdict, run.verdict.fit) == (Verdict.STOPS, False)
+    assert (run.verdict, run.verdict.fit) == (DryRunVerdict.STOPS, False)
     assert (run.fault.kind, run.fault.joint, run.fault.limit) == ("tracking", "joint03", 0.35)
     assert 0.0 <= run.duration_s < 3.0
     first = next(summary_lines(run, WIDE))
@@ -187,7 +187,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
 def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_same(robot, tmp_path):
     bare = dataclasses.replace(robot, safety=Safety(max_rate=4.0))
     run = dry_run(recorded(tmp_path / "wave.mcap", robot, wave(robot, 0.5)), robot=bare)
-    assert run.verdict is Verdict.REFUSED
+    assert run.verdict is DryRunVerdict.REFUSED
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
     assert math.isnan(run.approach_s)
     assert run.joints[0].rate == pytest.approx(0.4 * np.pi, rel=2e-3)

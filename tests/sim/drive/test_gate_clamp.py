@@ -13,7 +13,7 @@ from support.decoded_commands import ROBOT, on_the_bus
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.feedback import CurrentLimiter
-from undulog.sim.drive.limits import Clamp, Ending, Ramp, Spacing, gate_limits
+from undulog.sim.drive.limits import Clamp, EndingRamp, Ramp, Spacing, gate_limits
 from undulog.sim.drive.outcome import JointStatus
 
 LIMITS = gate_limits(ROBOT)
@@ -87,7 +87,9 @@ def test_an_ending_starts_where_the_joints_are(how):
     angle[6] = -0.3  # blocked: 0.5 rad from where it was sent
     angle[7] = np.nan
     unknown = np.full(25, np.nan)
-    ending = Ending(limits, last, JointStatus(angle, np.zeros(25), unknown, unknown, np.zeros(25)))
+    ending = EndingRamp(
+        limits, last, JointStatus(angle, np.zeros(25), unknown, unknown, np.zeros(25))
+    )
     begin = last.copy()
     begin[6] = -0.3
     np.testing.assert_array_equal(ending.at(0.0), begin)

@@ -17,14 +17,14 @@ from undulog.sim.drive.outcome import (
     DriveEnding,
     FaultKind,
     GateFault,
-    Phase,
+    GatePhase,
     jitter,
 )
 
 
 def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
     bench = Bench(start=0.1)
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     assert bench.gate.outcome.how is DriveEnding.COMPLETE
     way = np.abs(bench.gait.at(0.0) - 0.1).max()
     ramp_ticks = int(np.ceil(1.5 * way / 0.5 * RATE_HZ - 1e-9)) - 1
@@ -78,7 +78,7 @@ def test_a_joint_far_beyond_its_limits_is_not_driven_and_one_a_little_beyond_is_
     with pytest.raises(SourceError, match=r"joint01 is at 0.900 rad, 0.376 rad beyond its limits"):
         far.step()
     near = Bench(start=0.6)
-    near.until(Phase.DONE)
+    near.until(GatePhase.DONE)
     assert np.abs(near.sent).max() <= np.pi / 6
 
 
@@ -102,18 +102,18 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
     change, more, text, after_s = CASES[kind]
     limits = dataclasses.replace(LIMITS, on_fault=how, voltage=np.full(COUNT, 5.0))
     bench = Bench(Wave(0.5), duration_s=60.0, limits=limits)
-    bench.until(Phase.RUN)
+    bench.until(GatePhase.RUN)
     while kind == "tracking" and abs(bench.angle[6]) < 0.36:
         bench.step()
     first = bench.tick
-    while bench.gate.phase is Phase.RUN:
+    while bench.gate.phase is GatePhase.RUN:
         bench.step(change, **more)
     assert (bench.tick - 1 - first) / RATE_HZ == pytest.approx(after_s, abs=0.0101)
     outcome = bench.gate.outcome
     assert (outcome.fault.kind, outcome.how) == (kind, DriveEnding.FAULT)
     assert outcome.why.startswith(text)
     begun = len(bench.sent)
-    while bench.gate.phase is Phase.ENDING:
+    while bench.gate.phase is GatePhase.ENDING:
         bench.step(change, **more)
     assert fastest(bench.sent[begun - 2 :]) <= 4.0 / RATE_HZ * (1 + 1e-9)
     assert len(bench.sent) - begun <= (0.53 / 4.0 + 1.5 * 0.53 / 0.5 + 0.21) * RATE_HZ
@@ -129,7 +129,7 @@ def test_an_excess_that_goes_away_in_time_is_no_fault():
     remarks = []
     for k in range(280):
         remarks += bench.step(current=1.5 if k % 29 < 28 else 1.0).remarks  # 0.28 s of 0.29 s
-    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.phase is GatePhase.RUN
     shown = "gate: {}: draws more than 1.4 A: its command gives way"
     assert {text for _, text in remarks} >= {shown.format(name) for name in ROBOT.joint_names}
 
@@ -139,7 +139,7 @@ def test_where_nobody_listens_or_another_commands_nothing_more_is_sent(kind):
     bench = Bench(duration_s=60.0).running()
     count = len(bench.sent)
     assert bench.step(trouble=GateFault(kind, "so")).command is None
-    assert (bench.gate.phase, len(bench.sent)) == (Phase.DONE, count)
+    assert (bench.gate.phase, len(bench.sent)) == (GatePhase.DONE, count)
     assert bench.gate.outcome.ended.startswith("nothing more was sent")
 
 
@@ -149,22 +149,22 @@ def test_a_late_tick_is_caught_up_without_a_jump_and_too_late_a_one_is_a_fault()
         for _ in range(20):
             bench.step()
         bench.step(skip=19, late_s=0.19)
-    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.phase is GatePhase.RUN
     assert bench.gate.cuts["by_rate"] > 0
     assert fastest(bench.sent) <= 4.0 / RATE_HZ * (1 + 1e-9)
     before = bench.sent[-1]
     bench.step(skip=100, late_s=1.0)
-    assert bench.gate.phase is Phase.ENDING
+    assert bench.gate.phase is GatePhase.ENDING
     assert fastest([before, bench.sent[-1]]) <= 0.5 / RATE_HZ * (1 + 1e-9)
 
 
 def test_asked_to_stop_it_ends_and_asked_again_at_once():
     bench = Bench(duration_s=60.0).running(50)
     bench.step(stop="asked")
-    assert bench.gate.phase is Phase.ENDING
+    assert bench.gate.phase is GatePhase.ENDING
     bench.step(stop="asked")
     assert bench.step(stop="asked", at_once=True).command is None
-    assert bench.gate.phase is Phase.DONE
+    assert bench.gate.phase is GatePhase.DONE
     outcome = bench.gate.outcome
     assert (outcome.how, outcome.why) == (DriveEnding.STOPPED, "asked, twice")
 
@@ -172,7 +172,7 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
 def test_what_goes_wrong_while_it_ends_is_reported_once_and_ends_nothing_twice():
     bench = Bench(duration_s=60.0).running(50)
     remarks = list(bench.step(stop="asked").remarks)
-    while bench.gate.phase is Phase.ENDING:
+    while bench.gate.phase is GatePhase.ENDING:
         remarks += bench.step(stop="asked", temperature=99.0).remarks
     logs = [text for level, text in remarks if level == "error"]
     assert logs == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
@@ -185,9 +185,9 @@ def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
     sent, last = len(bench.sent), bench.sent[-1]
     found = [bench.step(received=False) for _ in range(200)]
     assert [step.command is not None for step in found] == [True] * 2 + [False] * 198
-    assert bench.gate.phase is Phase.HOLD
+    assert bench.gate.phase is GatePhase.HOLD
     assert np.abs(bench.sent[-1] - last).max() <= 2 * 4.0 / RATE_HZ
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     assert fastest(bench.sent[sent + 2 :]) <= 0.5 / RATE_HZ
     assert bench.gate.outcome.fault.kind is FaultKind.SILENT
@@ -198,7 +198,7 @@ def test_a_bus_that_stays_silent_gets_no_ramp():
     bench = Bench(duration_s=60.0, listen_s=0.5).running()
     for k in range(int(HOLD_S * RATE_HZ)):
         bench.step(received=False, silence_s=k / RATE_HZ)
-    assert bench.gate.phase is Phase.DONE
+    assert bench.gate.phase is GatePhase.DONE
     assert (bench.gate.outcome.how, bench.gate.outcome.fault.kind) == (DriveEnding.FAULT, "silent")
     assert bench.gate.outcome.ended.startswith("nothing more was sent")
 
@@ -218,7 +218,7 @@ def test_a_gait_that_says_nonsense_moves_nothing():
 
     bench = Bench(Nonsense(), duration_s=0.3)
     remarks = []
-    while bench.gate.phase is not Phase.DONE:
+    while bench.gate.phase is not GatePhase.DONE:
         remarks += bench.step().remarks
     assert not np.array(bench.sent).any()
     logs = [text for level, text in remarks if level == "warn"]
@@ -237,7 +237,7 @@ def test_a_gait_that_fails_and_a_log_that_can_not_be_written_end_as_a_fault_does
     bench = Bench(Failing(), duration_s=60.0).running()
     if not from_the_gait:
         bench.gate.report(GateFault(FaultKind.LOG, "the disk is full"))
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     assert fastest(bench.sent) <= 4.0 / RATE_HZ
     outcome = bench.gate.outcome

@@ -10,7 +10,7 @@ from support.gate_bench import COUNT, LIMITS, RATE_HZ, ROBOT, Bench, Wave, faste
 from undulog.capture.common.errors import SourceError
 from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.gate import Gate
-from undulog.sim.drive.outcome import DriveEnding, FaultKind, GateFault, Outcome, Phase
+from undulog.sim.drive.outcome import DriveEnding, FaultKind, GateFault, GatePhase, Outcome
 
 STEADY = "the joints were brought straight within 0.2 s"  # they are straight
 HALTED = "nothing more was sent; the servos hold their last commands"
@@ -35,7 +35,7 @@ def texts(bench, level=None):
 
 def changes(bench):
     """What it says of its phases."""
-    phases = "|".join(Phase)
+    phases = "|".join(GatePhase)
     return [text for text in texts(bench, "info") if text[6:].split(",")[0] in phases]
 
 
@@ -55,7 +55,7 @@ def changes(bench):
 def test_a_first_pose_within_a_step_of_the_ramp_is_run_at_once(pose, ramps):
     bench = Bench(Still(*pose))
     bench.step()
-    assert bench.gate.phase is (Phase.APPROACH if ramps else Phase.RUN)
+    assert bench.gate.phase is (GatePhase.APPROACH if ramps else GatePhase.RUN)
     assert bench.gate.run_from == (None if ramps else 0)
     assert bench.gate.run_ticks == (0 if ramps else 1)
 
@@ -69,7 +69,7 @@ def test_the_way_to_the_first_pose_is_told_with_its_longest_joint():
         "gate: approach, 0.9 s to the first pose, joint02 has the longest way, from 0.050 to "
         "-0.250 rad"
     )
-    bench.until(Phase.RUN)
+    bench.until(GatePhase.RUN)
     assert changes(bench)[2:] == ["gate: run"]
     assert bench.gate.run_from == 89  # the first command is 10 ms on its way
     assert len(bench.sent) == 90
@@ -79,7 +79,7 @@ def test_of_a_first_pose_that_is_no_angle_or_beyond_a_limit_the_rest_is_approach
     pose = np.full(COUNT, 0.1)
     pose[3], pose[4], pose[5] = np.nan, 2.0, -2.0
     bench = Bench(Still(*pose), start=0.02, duration_s=0.1)
-    bench.until(Phase.RUN)
+    bench.until(GatePhase.RUN)
     expected = np.clip(np.where(np.isnan(pose), 0.02, pose), LIMITS.lower, LIMITS.upper)
     np.testing.assert_allclose(bench.sent[-1], expected, atol=1e-12)
 
@@ -87,7 +87,7 @@ def test_of_a_first_pose_that_is_no_angle_or_beyond_a_limit_the_rest_is_approach
 def test_a_robot_in_lockstep_is_not_asked_who_it_is_and_needs_no_interval():
     bench = Bench(Still())
     bench.step(another_robot="somebody else", received=False)
-    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.phase is GatePhase.RUN
     assert bench.gate.silence.interval is None
 
 
@@ -102,9 +102,9 @@ def test_a_bus_that_reports_too_seldom_is_not_driven():
     )
     slow = Bench(Still(), listen_s=0.5)
     for tick in range(181):
-        assert slow.gate.phase is Phase.POSE
+        assert slow.gate.phase is GatePhase.POSE
         slow.step(received=tick % 45 == 0)
-    assert slow.gate.phase is Phase.RUN
+    assert slow.gate.phase is GatePhase.RUN
     assert slow.gate.silence.interval == 45
     assert slow.tick == 181
 
@@ -116,7 +116,7 @@ def test_trouble_beside_the_robot_refuses_too_and_a_stop_ends_it_quietly():
         bench.step()
     bench = Bench(listen_s=0.5)
     step = bench.step(stop="asked")
-    assert (step.phase, step.command, step.wanted, step.gait) == (Phase.DONE, None, None, None)
+    assert (step.phase, step.command, step.wanted, step.gait) == (GatePhase.DONE, None, None, None)
     assert bench.gate.outcome == Outcome(DriveEnding.STOPPED, "asked", "no command was sent")
     assert bench.gate.done
 
@@ -129,7 +129,7 @@ def test_a_run_has_a_tick_at_either_end_and_says_that_it_is_complete(duration_s)
     bench = Bench(Still(), duration_s=duration_s)
     ticks = round(duration_s * RATE_HZ) + 1
     steps = [bench.step() for _ in range(ticks)]
-    assert [step.phase for step in steps] == [Phase.RUN] * ticks
+    assert [step.phase for step in steps] == [GatePhase.RUN] * ticks
     assert bench.gate.done
     assert bench.gate.outcome == Outcome(
         DriveEnding.COMPLETE, "", "the servos hold their last commands"
@@ -138,7 +138,7 @@ def test_a_run_has_a_tick_at_either_end_and_says_that_it_is_complete(duration_s)
     assert all(step.gait is not None for step in steps)
     after = bench.step()
     assert after.remarks == ()
-    assert (after.phase, after.command) == (Phase.DONE, None)
+    assert (after.phase, after.command) == (GatePhase.DONE, None)
     assert texts(bench) == ["gate: reading the pose", "gate: run", "gate: done"]
     assert bench.gate.held_ticks == 0
 
@@ -152,7 +152,7 @@ def test_ticks_that_were_left_out_are_told_with_what_the_gait_lost():
         "gate: 0.012 s late, a control tick was left out",
         "gate: 0.075 s late, 7 control ticks were left out",
     ]
-    bench.until(Phase.RUN)
+    bench.until(GatePhase.RUN)
     progress = len(bench.sent)
     assert progress == pytest.approx(100 * 1.5 * 0.1 / 0.5, abs=1)  # no jump on the ramp
     bench.step(skip=1, late_s=0.01)
@@ -221,7 +221,7 @@ def test_a_fault_while_it_ends_for_another_reason_is_told_and_changes_nothing():
         "fault while ending: the robot is lost: no angle for more than 0.25 s",
     ]
     assert bench.gate.outcome == first
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     assert changes(bench)[2:] == [f"gate: ending, {why}; ramp-down", "gate: done"]
     assert bench.gate.outcome == first
 
@@ -230,7 +230,7 @@ def test_lateness_at_its_limit_is_borne():
     bench = Bench(Still(), duration_s=60.0).running()
     for late_s in (0.2, 0.1999):
         bench.step(late_s=late_s)
-    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.phase is GatePhase.RUN
 
 
 def test_a_stop_that_becomes_a_fault_is_one():
@@ -238,7 +238,7 @@ def test_a_stop_that_becomes_a_fault_is_one():
     bench.step(stop="asked")
     assert bench.gate.outcome == Outcome(DriveEnding.STOPPED, "asked", STEADY)
     step = bench.step(stop="asked", trouble=GateFault(FaultKind.BUS_OFF, "bus-off"))
-    assert (step.phase, step.command) == (Phase.DONE, None)
+    assert (step.phase, step.command) == (GatePhase.DONE, None)
     fault = GateFault(FaultKind.BUS_OFF, "bus-off")
     assert bench.gate.outcome == Outcome(DriveEnding.FAULT, "bus-off", HALTED, fault)
     assert changes(bench)[-1] == "gate: done, nothing is sent any more"
@@ -261,7 +261,7 @@ def test_where_the_robots_file_says_so_the_joints_are_held():
     bench.step(stop="asked")
     assert bench.gate.outcome.ended == "the joints were held where they were"
     count = len(bench.sent)
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     assert len(bench.sent) - count == 19  # 0.2 s in all
     assert changes(bench)[-2:] == ["gate: ending, asked; hold", "gate: done"]
 
@@ -294,7 +294,7 @@ def test_a_gait_that_fails_holds_the_command_before_and_is_asked_no_more():
     steps = [bench.step() for _ in range(5)]
     assert [step.gait is None for step in steps] == [False] * 3 + [True] * 2
     np.testing.assert_array_equal(steps[3].command, steps[2].command)
-    assert (steps[3].phase, steps[4].phase) == (Phase.RUN, Phase.ENDING)
+    assert (steps[3].phase, steps[4].phase) == (GatePhase.RUN, GatePhase.ENDING)
     why = "the gait failed: KeyError: 'range'"
     assert bench.gate.outcome.fault == GateFault(FaultKind.GAIT, why)
     assert isinstance(bench.gate.gait_error, KeyError)
@@ -326,11 +326,11 @@ def test_silence_is_told_in_ticks_and_seconds_and_held_for_as_long(at_tick):
     assert texts(bench)[-1] == "gate: a joint was received again"
     assert bench.gate.held_ticks == 15
     assert bench.step().command is not None
-    assert bench.gate.phase is Phase.ENDING
+    assert bench.gate.phase is GatePhase.ENDING
     ended = f"the servos held for 0.15 s, then {STEADY}"
     assert bench.gate.outcome.ended == ended
     assert changes(bench)[-1] == f"gate: ending, {fault.text}; ramp-down"
-    bench.until(Phase.DONE)
+    bench.until(GatePhase.DONE)
     assert bench.gate.outcome == Outcome(DriveEnding.FAULT, fault.text, ended, fault)
 
 
@@ -340,24 +340,24 @@ def test_each_ending_after_a_silence_begins_a_tick_after_the_first_joint():
         sent = [bench.step(received=False).command is not None for _ in range(3)]
         assert sent == [True, True, False]
         assert bench.step().command is None
-        assert bench.gate.phase is Phase.HOLD
+        assert bench.gate.phase is GatePhase.HOLD
         assert bench.step().command is not None
-        assert bench.gate.phase is Phase.ENDING
+        assert bench.gate.phase is GatePhase.ENDING
     assert bench.gate.held_ticks == 6
 
 
 def test_silence_while_it_ends_holds_and_ends_again():
     bench = Bench(Still(0.2), duration_s=60.0, listen_s=0.5).running(3)
     bench.step(stop="asked")
-    while bench.gate.phase is Phase.ENDING:
+    while bench.gate.phase is GatePhase.ENDING:
         bench.step(received=False, stop="asked")
-    assert bench.gate.phase is Phase.HOLD
+    assert bench.gate.phase is GatePhase.HOLD
     assert bench.gate.outcome.how is DriveEnding.FAULT
     count = len(bench.sent)
     for _ in range(20):
         bench.step(received=False, stop="asked")
     assert len(bench.sent) == count
-    bench.until(Phase.DONE, stop="asked")
+    bench.until(GatePhase.DONE, stop="asked")
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     assert fastest(bench.sent[count - 1 :]) <= 0.5 / RATE_HZ * (1 + 1e-9)
 
@@ -367,19 +367,19 @@ def test_while_it_holds_other_faults_wait_but_a_lost_bus_or_a_second_stop_ends_i
         bench = Bench(Still(), duration_s=60.0, listen_s=0.5).running(3)
         for _ in range(5):
             bench.step(received=False)
-        assert bench.gate.phase is Phase.HOLD
+        assert bench.gate.phase is GatePhase.HOLD
         return bench
 
     bench = holding()
     silent = bench.gate.outcome
     bench.step(received=False, late_s=3.0)
-    assert (bench.gate.phase, bench.gate.outcome) == (Phase.HOLD, silent)
+    assert (bench.gate.phase, bench.gate.outcome) == (GatePhase.HOLD, silent)
     bench.step(received=False, trouble=GateFault(FaultKind.STRANGER, "another one"))
     assert bench.gate.outcome == dataclasses.replace(silent, ended=HALTED)
     assert bench.gate.done
     bench = holding()
     bench.step(received=False, stop="asked")
-    assert bench.gate.phase is Phase.HOLD
+    assert bench.gate.phase is GatePhase.HOLD
     bench.step(received=False, stop="asked", at_once=True)
     assert bench.gate.outcome == dataclasses.replace(silent, ended=HALTED)
     assert bench.gate.done
@@ -387,7 +387,9 @@ def test_while_it_holds_other_faults_wait_but_a_lost_bus_or_a_second_stop_ends_i
 
 def test_a_bus_that_is_silent_for_ten_seconds_is_given_up():
     bench = Bench(Still(), duration_s=60.0, listen_s=0.5).running(3)
-    count = next(k for k in itertools.count(1) if bench.step(received=False).phase is Phase.DONE)
+    count = next(
+        k for k in itertools.count(1) if bench.step(received=False).phase is GatePhase.DONE
+    )
     assert count == 1000
     assert bench.gate.held_ticks == 998
     assert bench.gate.outcome.ended == HALTED
@@ -395,12 +397,17 @@ def test_a_bus_that_is_silent_for_ten_seconds_is_given_up():
     for _ in range(3):
         skipping.step(received=False)
     skipping.step(received=False, skip=995)
-    assert skipping.gate.phase is Phase.HOLD
+    assert skipping.gate.phase is GatePhase.HOLD
     skipping.step(received=False)
     assert skipping.gate.done
 
 
 def test_a_gate_begins_with_nothing():
     gate = Gate(Wave(), LIMITS, duration_s=1.0, place="can:test")
-    assert (gate.phase, gate.done, gate.outcome, gate.gait_error) == (Phase.POSE, False, None, None)
+    assert (gate.phase, gate.done, gate.outcome, gate.gait_error) == (
+        GatePhase.POSE,
+        False,
+        None,
+        None,
+    )
     assert (gate.run_from, gate.run_ticks, gate.run_s, gate.held_ticks) == (None, 0, 0.0, 0)

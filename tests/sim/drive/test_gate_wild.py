@@ -18,7 +18,7 @@ from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.gate import Gate
 from undulog.sim.drive.limits import gate_limits
-from undulog.sim.drive.outcome import FaultKind, GateFault, GateInput, JointStatus, Phase
+from undulog.sim.drive.outcome import FaultKind, GateFault, GateInput, GatePhase, JointStatus
 from undulog.sim.gait.contract import GaitTick, Readings
 
 COUNT, RATE_HZ = len(ROBOT.joints), 100
@@ -89,13 +89,13 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
             step(**moment)
         wave = np.full(COUNT, 0.3)
         for _ in range(1200):  # it comes to its end: an ending, or the planned one
-            if gate.phase is Phase.DONE:
+            if gate.phase is GatePhase.DONE:
                 break
             step(pose, np.zeros(COUNT), wave)
     except (SourceError, UsageError):
         assert not sent  # refused: before the first command, or never
         return
-    assert gate.phase is Phase.DONE
+    assert gate.phase is GatePhase.DONE
     assert gate.outcome is not None
     count = len(sent)
     step(pose, np.zeros(COUNT), np.zeros(COUNT))

@@ -12,7 +12,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import OnFault, Safety
 from undulog.sim.drive.limits import (
     Clamp,
-    Ending,
+    EndingRamp,
     GateLimits,
     Ramp,
     Spacing,
@@ -191,14 +191,16 @@ def test_a_ramp_is_as_long_as_its_slowest_joint_needs():
 def test_an_ending_is_from_where_the_joints_are_within_their_limits(how):
     last = np.array([0.4, 0.3, 0.8])
     # Farther than 0.3, 0.2, 0.3 rad from the command: the second, and the third beyond its limit.
-    ending = Ending(limits(on_fault=how), last, status(0.7, 0.09, 1.2))
+    ending = EndingRamp(limits(on_fault=how), last, status(0.7, 0.09, 1.2))
     start = [0.4, 0.09, 1.0]
     np.testing.assert_allclose(ending.at(0.0), start)
     target = start if how is OnFault.HOLD else np.zeros(3)
     np.testing.assert_allclose(ending.at(100.0), target)
     down_s = 0.0 if how is OnFault.HOLD else 1.5 * 1.0 / 0.5
     assert ending.duration_s == pytest.approx(0.2 + down_s + 0.2)  # 0.2 rad back at 1 rad/s
-    above = Ending(limits(on_fault=how, lower=np.full(3, 0.1)), np.full(3, 0.2), status(*[0.2] * 3))
+    above = EndingRamp(
+        limits(on_fault=how, lower=np.full(3, 0.1)), np.full(3, 0.2), status(*[0.2] * 3)
+    )
     rest = 0.2 if how is OnFault.HOLD else 0.1  # straight is beyond a limit
     np.testing.assert_allclose(above.at(100.0), np.full(3, rest))
     assert above.duration_s == pytest.approx(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.robot.model import OnFault
-from undulog.sim.drive.limits import Clamp, Ending, GateLimits, Ramp, Spacing
+from undulog.sim.drive.limits import Clamp, EndingRamp, GateLimits, Ramp, Spacing
 from undulog.sim.drive.outcome import JointStatus
 
 NS = 1_000_000_000
@@ -106,7 +106,7 @@ def test_an_ending_is_a_ramp_from_where_each_joint_is_to_its_rest(how):
         angle = np.add(last, away)
         nothing = np.full(4, np.nan)
         status = JointStatus(angle, nothing, nothing, nothing, np.zeros(4))
-        ending = Ending(given, np.array(last), status)
+        ending = EndingRamp(given, np.array(last), status)
         starts = [
             within(angle[k] if abs(away[k]) > 0.3 else last[k], LOWER[k], UPPER[k])
             for k in range(4)

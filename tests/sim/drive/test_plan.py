@@ -11,7 +11,7 @@ from support.twin_runs import check_keys
 from undulog.capture.common.errors import PlanError
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
-from undulog.sim.drive.plan import Plan, PlanGait, Segment, is_plan, parse_plan
+from undulog.sim.drive.plan import Plan, PlanGait, PlanSegment, is_plan, parse_plan
 
 H, V = Plane.HORIZONTAL, Plane.VERTICAL
 SLOW = PlaneGait(0.2, 0.5, 0.6)
@@ -37,7 +37,7 @@ def ran(gait, robot, seconds):
 def test_a_plan_that_changes_nothing_is_the_gait_itself(make_plan, make_robot):
     robot = make_robot()
     planes = {H: SLOW, V: PlaneGait(0.1, 0.7, 0.3, offset=0.05, phase=1.0)}
-    same = Segment(1.0, {**planes}), Segment(2.0, {**planes})
+    same = PlanSegment(1.0, {**planes}), PlanSegment(2.0, {**planes})
     plan = PlanGait(make_plan(*same, start=planes, ramp_s=2.0), robot)
     _, planned, _, _ = ran(plan, robot, 3.5)
     _, expected, _, _ = ran(SerpentineGait(Serpentine(planes, 2.0), robot), robot, 3.5)
@@ -47,7 +47,7 @@ def test_a_plan_that_changes_nothing_is_the_gait_itself(make_plan, make_robot):
 def test_values_follow_the_smooth_step(make_plan, make_robot):
     robot = make_robot()
     after = PlaneGait(0.4, 1.5, 0.2, wave="tail-to-head", offset=0.1)
-    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(3.0, {H: after}, 2.0, "turn"))
+    plan = make_plan(PlanSegment(1.0, {H: SLOW}), PlanSegment(3.0, {H: after}, 2.0, "turn"))
     times, _, values, modes = ran(PlanGait(plan, robot), robot, 5.0)
     x = np.clip((times - 1.0) / 2.0, 0.0, 1.0)
     share = 3 * x**2 - 2 * x**3
@@ -60,7 +60,9 @@ def test_values_follow_the_smooth_step(make_plan, make_robot):
 
 def test_the_phase_is_the_integral_of_omega_and_never_jumps(make_plan, make_robot):
     robot = make_robot()
-    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(3.0, {H: PlaneGait(0.2, 1.5, 0.6)}, 2.0))
+    plan = make_plan(
+        PlanSegment(1.0, {H: SLOW}), PlanSegment(3.0, {H: PlaneGait(0.2, 1.5, 0.6)}, 2.0)
+    )
     times, _, values, _ = ran(PlanGait(plan, robot), robot, 4.0)
     phase = values["horizontal.phase"]
     # Integral of S is x^3 - x^4 / 2. Held from tick to tick, omega is the left Riemann sum: with
@@ -76,7 +78,7 @@ def test_the_phase_is_the_integral_of_omega_and_never_jumps(make_plan, make_robo
 def test_commands_are_as_smooth_as_the_gaits_on_both_sides(make_plan, make_robot):
     robot = make_robot(planar=True)
     far = PlaneGait(0.4, 1.0, 1.2, wave="tail-to-head", offset=0.1)
-    plan = make_plan(Segment(2.0, {H: SLOW}), Segment(4.0, {H: far}, 3.0))
+    plan = make_plan(PlanSegment(2.0, {H: SLOW}), PlanSegment(4.0, {H: far}, 3.0))
     _, command, _, _ = ran(PlanGait(plan, robot), robot, 6.0)
     # |dq/dt| <= A' + Y' + A (omega + (m - 1) lag'), with S' <= 3 / (2 T).
     steepest = 1.5 / 3.0
@@ -86,7 +88,9 @@ def test_commands_are_as_smooth_as_the_gaits_on_both_sides(make_plan, make_robot
 
 def test_a_jump_of_the_values_leaves_the_phase_alone(make_plan, make_robot):
     robot = make_robot()
-    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(1.0, {H: PlaneGait(0.2, 1.0, 0.6)}, 0.0))
+    plan = make_plan(
+        PlanSegment(1.0, {H: SLOW}), PlanSegment(1.0, {H: PlaneGait(0.2, 1.0, 0.6)}, 0.0)
+    )
     _, command, values, _ = ran(PlanGait(plan, robot), robot, 2.0)
     assert values["horizontal.omega"][99:101].tolist() == [np.pi, 2 * np.pi]
     assert values["horizontal.phase"][100] == pytest.approx(np.pi)
@@ -200,7 +204,7 @@ def test_what_is_no_plan_says_why(text, message):
 def test_a_lag_may_turn_round_through_zero(make_plan, make_robot):
     robot = make_robot()
     back = PlaneGait(0.2, 0.5, 0.6, wave="tail-to-head")
-    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(2.0, {H: back}, 2.0))
+    plan = make_plan(PlanSegment(1.0, {H: SLOW}), PlanSegment(2.0, {H: back}, 2.0))
     _, _, values, _ = ran(PlanGait(plan, robot), robot, 3.0)
     assert values["horizontal.lag"][[0, 200, 300]] == pytest.approx([-0.6, 0.0, 0.6])
     assert math.isclose(values["horizontal.A"].min(), 0.2)

@@ -12,7 +12,7 @@ from undulog.capture.common.errors import PlanError
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, load_scenario
 from undulog.sim.drive import plan as module
-from undulog.sim.drive.plan import Plan, PlanGait, Segment, parse_plan
+from undulog.sim.drive.plan import Plan, PlanGait, PlanSegment, parse_plan
 from undulog.sim.gait.contract import Modulation
 from undulog.sim.gait.wave import Wave
 
@@ -56,7 +56,7 @@ def test_each_joints_values_are_those_of_the_formulas(seed, make_scenario, make_
         length_s = chance.choice([0.2, 0.35, 0.5])
         transition_s = chance.choice([0.0, 0.1, length_s])
         planes = {plane: wave(chance) for plane in PLANES}
-        segments.append(Segment(length_s, planes, transition_s, f"part{number}"))
+        segments.append(PlanSegment(length_s, planes, transition_s, f"part{number}"))
     ramp_s = chance.choice([0.0, 0.4])
     plan = Plan("p", "d", make_scenario(), start, ramp_s, tuple(segments))
     assert plan.duration_s == pytest.approx(sum(segment.duration_s for segment in segments))
@@ -101,7 +101,7 @@ def test_each_joints_values_are_those_of_the_formulas(seed, make_scenario, make_
 def test_values_of_single_joints_are_told_where_they_are_asked_for(make_scenario, make_robot):
     chance, robot = random.Random(1), make_robot(4)
     start = {Plane.HORIZONTAL: wave(chance)}
-    plan = Plan("p", "d", make_scenario(), start, 0.0, (Segment(1.0, start),))
+    plan = Plan("p", "d", make_scenario(), start, 0.0, (PlanSegment(1.0, start),))
     names = {name.partition(".")[0] for name in PlanGait(plan, robot).names}
     assert names == {"horizontal"}
     assert (plan.segments[0].transition_s, plan.segments[0].mode) == (1.0, "walk")

@@ -16,13 +16,13 @@ from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 from undulog.sim.drive import session as module
 from undulog.sim.drive.loop import BusTick
 from undulog.sim.drive.motion import find_motion
-from undulog.sim.drive.outcome import GateStep, Phase
+from undulog.sim.drive.outcome import GatePhase, GateStep
 from undulog.sim.drive.over_bus import bus_plan
 from undulog.sim.drive.session import BusSession, GaitPublisher
 from undulog.sim.gait.contract import GaitTick
 
 EPOCH_NS, MS = 1_735_689_600_000_000_000, 1_000_000
-QUIET = GateStep(Phase.RUN, None, None, None, ())
+QUIET = GateStep(GatePhase.RUN, None, None, None, ())
 
 
 def frames(identifier, host_ms, device_ns=None, way=DIR_RX):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.sim import FrictionLaw, Ground
-from undulog.sim.physics.contact import FRICTION, GroundContact, normal_force, tangents
+from undulog.sim.physics.contact import FRICTION, GroundLaw, normal_force, tangents
 from undulog.sim.physics.steps import Steps
 
 COULOMB = tuple(law for law in FrictionLaw if law is not FrictionLaw.VISCOUS)
@@ -24,7 +24,7 @@ def touch(ground, *state):
     link = Steps.empty(1, 1, 0)[0]
     for field, value in zip(link.body, state, strict=False):
         field[...] = value
-    GroundContact(ground, np.array([0.025]), link.body, link.contact).act()
+    GroundLaw(ground, np.array([0.025]), link.body, link.contact).act()
     return link.contact
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from support.twin_runs import SNAKE13, check_keys, faults_of
 from undulog.capture import load_robot
-from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.common.strict_table import Faults, StrictTable
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
 from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
@@ -74,7 +74,7 @@ gaits = st.one_of(
 
 def read(text, robot=ROBOT):
     faults = Faults()
-    gait = read_gait(Table(tomllib.loads(text), "gait", faults), robot)
+    gait = read_gait(StrictTable(tomllib.loads(text), "gait", faults), robot)
     return gait, {fault.key: str(fault) for fault in faults.all()}
 
 

@@ -12,7 +12,7 @@ from support.twin_runs import SNAKE25, check_keys, faults_of
 from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.sim import load_scenario, parse_scenario, record
-from undulog.sim.scenario.bus_faults import BusFault, FaultKind, parse_faults
+from undulog.sim.scenario.bus_faults import BusFault, BusFaultKind, parse_faults
 
 ROBOT = load_robot("snake25")
 BASE = SNAKE25.replace("2.0", "0.1")
@@ -21,15 +21,15 @@ BASE = SNAKE25.replace("2.0", "0.1")
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("lost:joint07:0.1", BusFault(FaultKind.LOST, "joint07", 0.1)),
-        ("lost:1", BusFault(FaultKind.LOST, "", 1.0)),
-        ("lost:0.5@2", BusFault(FaultKind.LOST, "", 0.5, 2.0)),
-        ("stuck:joint01@5", BusFault(FaultKind.STUCK, "joint01", 0.0, 5.0)),
-        ("frozen:joint25@5+2.5", BusFault(FaultKind.FROZEN, "joint25", 0.0, 5.0, 2.5)),
-        ("over-current:joint07:1.5@5", BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0)),
-        ("bus-off@5+2", BusFault(FaultKind.BUS_OFF, "", 0.0, 5.0, 2.0)),
-        ("noise:1e-3", BusFault(FaultKind.NOISE, "", 0.001)),
-        ("delay:0.02", BusFault(FaultKind.DELAY, "", 0.02)),
+        ("lost:joint07:0.1", BusFault(BusFaultKind.LOST, "joint07", 0.1)),
+        ("lost:1", BusFault(BusFaultKind.LOST, "", 1.0)),
+        ("lost:0.5@2", BusFault(BusFaultKind.LOST, "", 0.5, 2.0)),
+        ("stuck:joint01@5", BusFault(BusFaultKind.STUCK, "joint01", 0.0, 5.0)),
+        ("frozen:joint25@5+2.5", BusFault(BusFaultKind.FROZEN, "joint25", 0.0, 5.0, 2.5)),
+        ("over-current:joint07:1.5@5", BusFault(BusFaultKind.OVER_CURRENT, "joint07", 1.5, 5.0)),
+        ("bus-off@5+2", BusFault(BusFaultKind.BUS_OFF, "", 0.0, 5.0, 2.0)),
+        ("noise:1e-3", BusFault(BusFaultKind.NOISE, "", 0.001)),
+        ("delay:0.02", BusFault(BusFaultKind.DELAY, "", 0.02)),
     ],
 )
 def test_faults_on_the_command_line(text, fault):
@@ -80,7 +80,7 @@ numbers = st.floats(1e-3, 0.9)
                 from_s,
                 for_s,
             ),
-            st.sampled_from(FaultKind),
+            st.sampled_from(BusFaultKind),
             st.sampled_from(ROBOT.joint_names),
             numbers,
             st.one_of(st.just(0.0), numbers),

@@ -155,7 +155,7 @@ def test_least_is_the_least_within_the_span(steps, span):
 def test_the_body_bends_where_the_head_did_also_when_omega_changes():
     """Y(t) = sin of the phase: joint i must show it (i - 1) |lag| of phase later, exactly so."""
     lag, phase = -math.pi / 6, 0.0
-    wave = filters.BodyWave(13, lag)
+    wave = filters.PassedWave(13, lag)
     for tick in range(900):
         phase += 0.01 * math.pi * (1.0 if tick < 700 else 1.3)
         bent = wave.step(phase, math.sin(phase))
@@ -164,7 +164,7 @@ def test_the_body_bends_where_the_head_did_also_when_omega_changes():
 
 
 def test_the_body_is_straight_until_the_wave_comes():
-    wave = filters.BodyWave(4, 1.0)
+    wave = filters.PassedWave(4, 1.0)
     wave.step(0.0, 0.0)
     for k in range(1, 16):
         bent = wave.step(0.1 * k, 0.2)

@@ -9,7 +9,7 @@ from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.buffers import ColumnStore, EchoColumn, Times, TimeStore
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.read.sample_times import Series, own_times
+from undulog.capture.log.read.sample_times import JointSeries, own_times
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 6)]
@@ -102,8 +102,8 @@ def test_frames_come_in_the_order_they_were_logged(tmp_path):
 
 def test_own_times_of_series_that_are_stamped_differently():
     stamps = np.array([100, 200, 300, 400])
-    offsets = Series(("a",), [stamps], [np.array([1e-9, 2e-9, np.nan, 4e-9])])
-    series = Series(("a", "b"), [np.array([50, 250, 350])] * 2, [np.zeros(3)] * 2)
+    offsets = JointSeries(("a",), [stamps], [np.array([1e-9, 2e-9, np.nan, 4e-9])])
+    series = JointSeries(("a", "b"), [np.array([50, 250, 350])] * 2, [np.zeros(3)] * 2)
     (own,) = own_times([series], offsets)
     assert own[0].tolist() == [51, 252, 350]
     assert own[1].tolist() == [50, 250, 350]

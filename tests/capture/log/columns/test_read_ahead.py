@@ -13,7 +13,7 @@ from support.foreign_logs import rewrite
 from support.processes import once, python
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.process import Piece, helpers
+from undulog.capture.common.process import WorkPiece, helpers
 from undulog.capture.log.columns import blocks as arenas
 from undulog.capture.log.columns.blocks import ahead
 from undulog.capture.log.file.log_file import LogFile
@@ -180,7 +180,7 @@ def test_work_is_begun_so_far_ahead_and_no_further():
 @pytest.mark.parametrize("threads", [1, 3])
 def test_an_error_comes_where_the_result_is_asked_for(threads):
     with helpers(threads) as pool:
-        pieces = [Piece(lambda n=n: 12 // n, pool) for n in (1, 0, 3)]
+        pieces = [WorkPiece(lambda n=n: 12 // n, pool) for n in (1, 0, 3)]
         assert pieces[0].result() == 12
         with pytest.raises(ZeroDivisionError):
             pieces[1].result()
@@ -192,7 +192,7 @@ def test_an_error_comes_where_the_result_is_asked_for(threads):
 def test_each_piece_is_done_once_whoever_does_it(threads):
     done = []
     with helpers(threads) as pool:
-        pieces = [Piece(lambda n=n: done.append(n) or n, pool) for n in range(200)]
+        pieces = [WorkPiece(lambda n=n: done.append(n) or n, pool) for n in range(200)]
         for piece in reversed(pieces):
             piece.hurry()
         assert [piece.result() for piece in pieces] == list(range(200))
@@ -203,8 +203,8 @@ def test_each_piece_is_done_once_whoever_does_it(threads):
 def test_who_needs_a_result_does_not_wait_for_helpers_that_are_busy():
     gate = threading.Event()
     with helpers(2) as pool:
-        Piece(gate.wait, pool)
-        assert Piece(threading.get_ident, pool).result() == threading.get_ident()
+        WorkPiece(gate.wait, pool)
+        assert WorkPiece(threading.get_ident, pool).result() == threading.get_ident()
         gate.set()
 
 
@@ -212,7 +212,7 @@ def test_what_has_not_begun_is_left_undone_at_the_end():
     done, gate = [], threading.Event()
     with ExitStack() as endings, helpers(3) as pool:
         for n in range(50):
-            Piece(lambda n=n: (gate.wait(), done.append(n)), pool)
+            WorkPiece(lambda n=n: (gate.wait(), done.append(n)), pool)
         waiting = pool._work_queue
         endings.enter_context(once(lambda: waiting.qsize() <= 1, gate.set, "the rest is cancelled"))
     assert len(done) < 50

@@ -7,7 +7,7 @@ import pytest
 from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
-from undulog.capture.log.health.findings import Fault, joined, listed
+from undulog.capture.log.health.findings import ChannelFault, joined, listed
 from undulog.capture.log.health.session_check import check_session
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -57,10 +57,10 @@ def test_the_figures_are_those_of_the_worst():
     gap = (5 * 10**9, 6 * 10**9)
     later = (gap[0] + 10**8, gap[1] + 10**8)
     faults = [
-        Fault(1, "/a", "", "1 of it", 1, gap, 0.01),
-        Fault(1, "/b", "", "9 of it", 1, later, 0.09),
-        Fault(0, "/c", "", "a note", 1, gap, 0.001),
-        Fault(1, "/d", "", "two gaps", 2, gap, 0.02),
+        ChannelFault(1, "/a", "", "1 of it", 1, gap, 0.01),
+        ChannelFault(1, "/b", "", "9 of it", 1, later, 0.09),
+        ChannelFault(0, "/c", "", "a note", 1, gap, 0.001),
+        ChannelFault(1, "/d", "", "two gaps", 2, gap, 0.02),
     ]
     assert [(one.weight, one.sentence) for one in joined(faults)] == [
         (1, "/a and /b, lost together: at most 9 of it"),
@@ -71,7 +71,7 @@ def test_the_figures_are_those_of_the_worst():
 
 def test_joints_that_differ_have_reasons_of_their_own():
     faults = [
-        Fault(1, topic, name, f"{3 if name == 'j2' else 1} of 400")
+        ChannelFault(1, topic, name, f"{3 if name == 'j2' else 1} of 400")
         for topic in ("/x", "/y")
         for name in ("j1", "j2", "j3")
     ]

@@ -11,7 +11,7 @@ from support.analysed import analysed
 from support.ros_bags import ARRAY, EPOCH_NS, NAMES, commanded, filling, message, ticks, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.log.read.joint_messages import Trajectory, joint_source, points_in_force
+from undulog.capture.log.read.joint_messages import JointTrajectory, joint_source, points_in_force
 
 
 def opened(tmp_path, fill):
@@ -194,7 +194,9 @@ def test_any_name_is_read_or_refused(text, end):
 )
 def test_a_later_trajectory_replaces_what_is_not_yet_due(drawn):
     every = [
-        Trajectory(t, 0, ("a",), np.array(after), {"position": np.full((len(after), 1), float(k))})
+        JointTrajectory(
+            t, 0, ("a",), np.array(after), {"position": np.full((len(after), 1), float(k))}
+        )
         for k, (t, after) in enumerate(sorted(drawn, key=lambda one: one[0]))
     ]
     (found,), replaced = points_in_force(every, "position", 0)
