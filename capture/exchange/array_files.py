@@ -243,8 +243,8 @@ def _named(value: object) -> dict[str, _Tensor | None]:
         elif isinstance(item, Mapping):
             inner = list(cast("Mapping[object, object]", item).items())
             waiting += [
-                (f"{name}.{key}" if name else str(key), each, depth + 1)
-                for key, each in inner[::-1]
+                (f"{name}.{key}" if name else str(key), nested, depth + 1)
+                for key, nested in inner[::-1]
             ]
         else:
             tensors[name] = None
@@ -349,8 +349,8 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
         check_cells(path, size // 8)
         numeric = ("double", "single", "logical", "int", "uint")
         names = [name for name, _, kind in listed if kind.startswith(numeric)]
-        found = loadmat(path, variable_names=names) if names else {}
-        return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
+        arrays = loadmat(path, variable_names=names) if names else {}
+        return {name: arrays[name] for name in names if isinstance(arrays.get(name), np.ndarray)}
 
 
 def _check_mat(path: Path) -> None:

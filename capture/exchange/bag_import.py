@@ -95,18 +95,18 @@ def import_bag(
         if session.library.startswith("undulog/"):
             _check_exported(source, robot, topics)
             return _restored(source, session, output, force=force, stop=stop)
-        found = _found(source, session, topics)
+        joint_topics = _found(source, session, topics)
         report = ImportReport(
             source, output, session.robot.name if session.robot else "unknown robot"
         )
         report.start_ns, report.end_ns = session.start_ns, session.end_ns
-        report.notes += found.notes
+        report.notes += joint_topics.notes
         files = [source] if source.is_file() else sorted(p for p in source.iterdir() if p.is_file())
         facts = {
             "import.format": "rosbag1" if source.suffix == ".bag" else "rosbag2",
             "import.time": "as recorded",
-            "import.commands": found.command,
-            "import.responses": found.response,
+            "import.commands": joint_topics.command,
+            "import.responses": joint_topics.response,
         }
         writer = stack.enter_context(
             imported_session(
@@ -114,7 +114,7 @@ def import_bag(
                 digest=partial(digest_of, files),
             )
         )  # fmt: skip
-        joints = _Joints(session, writer, found, report)
+        joints = _Joints(session, writer, joint_topics, report)
         for share in joints.write(stop):
             bar.update(begun + (1 - begun) * share / 2, "joints")
         if report.complete:
@@ -163,12 +163,12 @@ def _restored(
 
 
 def _found(source: Path, session: Session, topics: tuple[str, str]) -> JointTopics:
-    found = session.joint_topics(*topics)
-    names = [found.command, found.response]
+    joint_topics = session.joint_topics(*topics)
+    names = [joint_topics.command, joint_topics.response]
     if not any(session.joint_channel(name) for name in names):
-        there = found.others or sorted(session.channels)
+        there = joint_topics.others or sorted(session.channels)
         raise MissingChannelError(source, " or ".join(names), there, HOW_TO_CHOOSE)
-    return found
+    return joint_topics
 
 
 @dataclass(frozen=True)
@@ -201,14 +201,14 @@ class _Target:
         log_ns, stamp_ns = rows[0].log_ns, rows[0].stamp_ns
         at = {name: j for j, name in enumerate(self.joints)}
         matrices: list[NDArray[Any]] = []
-        known = False
+        filled = False
         for row in rows:
             matrix = np.full((len(log_ns), len(self.joints)), np.nan)
             if row.names and row.values.shape == (len(log_ns), len(row.names)):
                 matrix[:, [at[name] for name in row.names]] = row.values
-                known = True
+                filled = True
             matrices.append(matrix)
-        return [log_ns, stamp_ns, *matrices] if known else None
+        return [log_ns, stamp_ns, *matrices] if filled else None
 
 
 class _Joints:
@@ -239,20 +239,20 @@ class _Joints:
                 report.notes.append(f"{topic} is {name} of the recording")
 
     def _target(self, writer: SessionWriter, topic: str, name: str) -> _Target | None:
-        known = self._session.joint_fields(name)
-        every = dict.fromkeys(joint for joints in known.values() for joint in joints)
+        carried = self._session.joint_fields(name)
+        every = dict.fromkeys(joint for joints in carried.values() for joint in joints)
         if len(every) > MOST_JOINTS:
             why = f"{name} has {len(every)} joints; at most {MOST_JOINTS} are imported"
             raise ImportFormatError(self._report.source, why)
         chain = self._session.robot.joint_names if self._session.robot else ()
-        joints = [one for one in chain if one in every]
-        joints += [one for one in every if one not in chain]
+        joints = [joint for joint in chain if joint in every]
+        joints += [joint for joint in every if joint not in chain]
         allowed = UNITS if topic == RESPONSE_TOPIC else ("position",)
-        if rest := [one for one in known if one not in allowed]:
+        if rest := [field for field in carried if field not in allowed]:
             self._report.notes.append(
                 f"{name}: {' and '.join(rest)} left out, {topic} has no place"
             )
-        fields = tuple(one for one in known if one in allowed)
+        fields = tuple(field for field in carried if field in allowed)
         if not joints or not fields:
             return None
         channel = writer.joint_state(
@@ -287,14 +287,16 @@ class _Joints:
     def _write_window(
         self, targets: Sequence[_Target], start_ns: int | None, stop_ns: int | None
     ) -> None:
-        wanted = {target.name: target.fields for target in targets}
-        found = self._session.joint_messages(wanted, start_ns, stop_ns) if targets else {}
+        fields = {target.name: target.fields for target in targets}
+        messages = self._session.joint_messages(fields, start_ns, stop_ns) if targets else {}
         for target in targets:
-            groups = zip(*(found[target.name, field] for field in target.fields), strict=True)
+            groups = zip(*(messages[target.name, field] for field in target.fields), strict=True)
             parts = [part for rows in groups if (part := target.rows(rows)) is not None]
             if not parts:
                 continue
-            log_ns, stamp_ns, *values = (np.concatenate(each) for each in zip(*parts, strict=True))
+            log_ns, stamp_ns, *values = (
+                np.concatenate(arrays) for arrays in zip(*parts, strict=True)
+            )
             if (early := stamp_ns < 0).any():
                 stamp_ns = np.where(early, log_ns, stamp_ns)
                 text = f"{target.topic}: stamps before 1970 are replaced by log times"
@@ -302,7 +304,7 @@ class _Joints:
             order = np.argsort(log_ns, kind="stable")
             by_field = dict(zip(target.fields, (value[order] for value in values), strict=True))
             none = [()] * len(order)
-            columns = (by_field.get(one, none) for one in UNITS)
+            columns = (by_field.get(field, none) for field in UNITS)
             write = target.channel.write
             for t_ns, logged, position, velocity, effort in zip(
                 stamp_ns[order].tolist(), log_ns[order].tolist(), *columns, strict=True

@@ -255,15 +255,15 @@ class _Import:
     def add(self, block: LogBlock) -> None:
         raw, messages = list[_RawMessage](), list[TopicMessages]()
         for index, name in enumerate(self._log.buses):
-            own = block[block.bus == index]
-            if not len(own):
+            part = block[block.bus == index]
+            if not len(part):
                 continue
-            raw += self._raw_messages(FRAME_TOPIC_PREFIX + name, own.classic())
-            raw += self._raw_messages(FD_TOPIC_PREFIX + name, own.frames[own.is_fd])
+            raw += self._raw_messages(FRAME_TOPIC_PREFIX + name, part.classic())
+            raw += self._raw_messages(FD_TOPIC_PREFIX + name, part.frames[part.is_fd])
             if name != self._chosen:
-                self._other_buses[name] += len(own)
+                self._other_buses[name] += len(part)
             elif self._decoder is not None and self._topics is not None:
-                samples, tally = self._decoder.decode(own.to_decode())
+                samples, tally = self._decoder.decode(part.to_decode())
                 self._tally.add(tally)
                 self._unseen -= _targets(samples) if self._unseen else set()
                 messages += self._topics.add(samples)
@@ -304,9 +304,9 @@ class _Import:
             for rows in _batches(messages.sampled_ns[order]):
                 part = messages.part(order[rows])
                 pieces.append((int(part.sampled_ns[0]), part))
-        for one in raw:
-            samples[one.topic] = samples.get(one.topic, 0) + 1
-            pieces.append((one.log_ns, one))
+        for message in raw:
+            samples[message.topic] = samples.get(message.topic, 0) + 1
+            pieces.append((message.log_ns, message))
         for _, piece in sorted(pieces, key=lambda item: item[0] // _BATCH_NS):
             if isinstance(piece, TopicMessages):
                 piece.write(piece.sampled_ns)
@@ -342,8 +342,8 @@ def _batches(t_ns: IntArray) -> list[IntArray]:
 
 def _targets(samples: Iterable[DecodedSignals]) -> set[str]:
     """Return the joints and sensors that have samples."""
-    found: set[str] = set()
+    targets: set[str] = set()
     for decoded in samples:
         members: list[int] = np.unique(decoded.member).tolist()
-        found.update(decoded.signals[member].target for member in members)
-    return found
+        targets.update(decoded.signals[member].target for member in members)
+    return targets

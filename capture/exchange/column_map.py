@@ -85,8 +85,8 @@ class MappedColumn:
     def is_plain(self) -> bool:
         """Whether its cells are values in the session's unit."""
         unit = unit_for(self.unit, self.quantity)
-        own = (self.wrap, self.scale, self.offset, unit.factor, unit.offset)
-        return own == (0.0, 1.0, 0.0, 1.0, 0.0)
+        conversion = (self.wrap, self.scale, self.offset, unit.factor, unit.offset)
+        return conversion == (0.0, 1.0, 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class ColumnMap:
 
     def time_of(self, table: str) -> tuple[str, str]:
         """Return column and unit of the times in a table."""
-        own = self.commands_time if table == COMMANDS else None
-        return own or (self.time_column, self.time_unit)
+        commands_time = self.commands_time if table == COMMANDS else None
+        return commands_time or (self.time_column, self.time_unit)
 
     def toml(self) -> str:
         """Return the map as a TOML file, for the session's attachments."""
@@ -197,16 +197,16 @@ def _parse(
     top = StrictTable(values, "", faults)
     delimiter = top.text("delimiter", ",")
     if delimiter not in _DELIMITERS:
-        top.fault("delimiter", " ".join(json.dumps(each) for each in _DELIMITERS))
+        top.fault("delimiter", " ".join(json.dumps(delimiter) for delimiter in _DELIMITERS))
     time = _time(top.table("time"))
-    own = _time(top.table("commands_time")) if "commands_time" in top else None
+    commands_time = _time(top.table("commands_time")) if "commands_time" in top else None
     entries = top.tables("columns")
     if not entries:
         top.fault("columns", "at least one column")
     columns = tuple(_column(entry, robot.joint_names if robot else None) for entry in entries)
     top.close()
     _note_repeated(faults, columns)
-    return ColumnMap(*time, columns, delimiter, own), faults.all()
+    return ColumnMap(*time, columns, delimiter, commands_time), faults.all()
 
 
 def _time(table: StrictTable) -> tuple[str, str]:
@@ -278,10 +278,10 @@ class JointTopic:
                 in a message.
             quantities: One of :func:`topics_of`.
         """
-        self._joints = list(dict.fromkeys(joint for joint, each in columns if each in quantities))
+        self._joints = list(dict.fromkeys(joint for joint, kind in columns if kind in quantities))
         self._fields = (quantities[0], *(q for q in _WITH_POSITION if q in quantities[1:]))
         self._places = [
-            [self._joints.index(joint) for joint, each in columns if each is quantity]
+            [self._joints.index(joint) for joint, kind in columns if kind is quantity]
             for quantity in self._fields
         ]
         self._rest = [q in quantities[1:] for q in _WITH_POSITION]
@@ -303,13 +303,13 @@ class JointTopic:
         Returns:
             Number of rows written.
         """
-        found = [
+        columns = [
             self._spread(values[q], at) for q, at in zip(self._fields, self._places, strict=True)
         ]
-        if not any(np.isnan(field.min()) for field in found):
-            self._write_part(t_ns, found, np.ones(len(self._joints), dtype=bool))
+        if not any(np.isnan(field.min()) for field in columns):
+            self._write_part(t_ns, columns, np.ones(len(self._joints), dtype=bool))
             return len(t_ns)
-        fields = np.stack(found)
+        fields = np.stack(columns)
         absent = np.isnan(fields)
         sampled: BoolArray = ~np.all(absent, axis=0)
         filled = np.any(sampled, axis=1)

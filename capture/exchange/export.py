@@ -236,17 +236,19 @@ def export_columns(
                 f"{source} has {len(chosen)} joint topics; a table takes at most {_MOST_TOPICS}: "
                 "name those that you want with --topics"
             )
-        wanted = {topic: joint_fields(session, topic) for topic in chosen}
-        columns = [name for found in wanted.values() for name in found.values()]
-        rows = dict.fromkeys(wanted, 0)
-        warnings = [f"{topic} carries no values" for topic, found in wanted.items() if not found]
+        fields = {topic: joint_fields(session, topic) for topic in chosen}
+        columns = [name for names in fields.values() for name in names.values()]
+        rows = dict.fromkeys(fields, 0)
+        warnings = [
+            f"{topic} carries no values" for topic, columns in fields.items() if not columns
+        ]
         with (
             part_file(output) as part,
-            progress(f"export {output.name}", len(wanted)) as bar,
+            progress(f"export {output.name}", len(fields)) as bar,
             open_table(part, columns) as write,
         ):
-            for number, (topic, found) in enumerate(wanted.items()):
-                for block, done in _blocks(session, topic, found) if found else ():
+            for number, (topic, names) in enumerate(fields.items()):
+                for block, done in _blocks(session, topic, names) if names else ():
                     write(block)
                     rows[topic] += len(block.t_ns)
                     bar.update(number + done)
@@ -340,14 +342,14 @@ TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}
 """Suffix to the function that creates a table with columns of some names."""
 
 
-def joint_topics(session: Session, wanted: Sequence[str]) -> list[str]:
+def joint_topics(session: Session, topics: Sequence[str]) -> list[str]:
     """Return the requested JointState topics; if none, commands and what the joints measure.
 
     Raises:
         MissingChannelError: If none are requested and the session has none.
     """
-    if wanted:
-        return list(dict.fromkeys(wanted))
+    if topics:
+        return list(dict.fromkeys(topics))
     joint = [t for t, channel in session.channels.items() if channel.type_name == JOINT_STATE]
     if not joint:
         raise MissingChannelError(session.path, "joint topics", sorted(session.channels))
@@ -356,7 +358,7 @@ def joint_topics(session: Session, wanted: Sequence[str]) -> list[str]:
 
 def joint_fields(session: Session, topic: str) -> dict[str, str]:
     """Return the fields that a topic carries, with the names of their columns."""
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for name in UNITS:
         try:
             unit = session.joints(topic, name).unit
@@ -366,10 +368,10 @@ def joint_fields(session: Session, topic: str) -> dict[str, str]:
             continue
         # The contract puts every quantity of a joint, not only angles, into a position.
         named_by_topic = name == "position" and unit != UNITS[name]
-        found[name] = (
+        columns[name] = (
             topic.removeprefix("/") + ("" if named_by_topic else f".{name}") + f" [{unit}]"
         )
-    return found
+    return columns
 
 
 def _blocks(
@@ -390,11 +392,11 @@ def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
     """
     sets: list[list[JointSignals]] = []
     for signal in signals:
-        for known in sets:
-            if known[0].names == signal.names and all(
-                np.array_equal(a, b) for a, b in zip(known[0].t_ns, signal.t_ns, strict=True)
+        for group in sets:
+            if group[0].names == signal.names and all(
+                np.array_equal(a, b) for a, b in zip(group[0].t_ns, signal.t_ns, strict=True)
             ):
-                known.append(signal)
+                group.append(signal)
                 break
         else:
             sets.append([signal])

@@ -155,7 +155,7 @@ def blocks_of(rows: Iterable[FrameRow], done: Callable[[], float]) -> Iterator[L
         frames = empty_fd_frames(len(batch))
         frames["t_host_ns"], frames["id_flags"], frames["len"] = t_ns, id_flags, length
         frames["dir"], frames["fd_flags"] = way, fd_flags
-        padded = b"".join(each.ljust(64, b"\0") for each in data)
+        padded = b"".join(payload.ljust(64, b"\0") for payload in data)
         frames["data"] = np.frombuffer(padded, np.uint8).reshape(-1, 64)
         share = done() if len(batch) == FRAMES_PER_BLOCK else 1.0
         yield LogBlock(frames, np.array(bus), np.array(is_fd), share)
@@ -276,11 +276,11 @@ def frame_blocks(
     held = block_of(empty_fd_frames(0), 0)
     windows = list(pairwise(_edges(session, [topic for topic, _, _ in topics])))
     for number, (start_ns, stop_ns) in enumerate(windows, start=1):
-        found = [
+        blocks = [
             block_of(read(topic, start_ns=start_ns, stop_ns=stop_ns), bus)
             for topic, bus, read in topics
         ]
-        block = joined([held, *found])
+        block = joined([held, *blocks])
         if len(topics) > 1:
             block = block[np.lexsort((block.bus, block.is_fd, block.times_ns()))]
             if stop_ns is not None:

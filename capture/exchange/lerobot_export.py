@@ -105,7 +105,9 @@ class Episode:
 
     def names(self) -> dict[str, list[str]]:
         """Return the joints of each feature."""
-        return {name: [each.joint for each in feature] for name, feature in self.features.items()}
+        return {
+            name: [signal.joint for signal in feature] for name, feature in self.features.items()
+        }
 
     def _signals(self) -> Iterator[HeldSignal]:
         for feature in self.features.values():
@@ -176,12 +178,12 @@ def read_episode(session: Session, task: str | None = None) -> tuple[Episode, li
         DataError: If a joint has no samples, or values that float32 can't hold.
     """
     topics = {name: JOINT_TOPIC[quantity] for name, quantity in FEATURES.items()}
-    wanted = {topic: ["position"] for topic in topics.values() if topic in session.channels}
-    if not wanted:
+    present = {topic: ["position"] for topic in topics.values() if topic in session.channels}
+    if not present:
         missing = " and no ".join(topics.values())
         raise MissingChannelError(session.path, missing, sorted(session.channels))
-    notes = [f"no {topic}: no {name}" for name, topic in topics.items() if topic not in wanted]
-    read = session.joint_columns(wanted)
+    notes = [f"no {topic}: no {name}" for name, topic in topics.items() if topic not in present]
+    read = session.joint_columns(present)
     features: dict[str, list[HeldSignal]] = {}
     for name, quantity in FEATURES.items():
         signals = read.get((topics[name], "position"))
@@ -190,10 +192,10 @@ def read_episode(session: Session, task: str | None = None) -> tuple[Episode, li
         if signals.unit != SESSION_UNIT[quantity]:
             notes.append(f"{name} is in {signals.unit}")
         features[name] = [
-            _held(session, signals.topic, *each)
-            for each in zip(signals.names, signals.t_ns, signals.values, strict=True)
+            _held(session, signals.topic, *samples)
+            for samples in zip(signals.names, signals.t_ns, signals.values, strict=True)
         ]
-    others = [topic for topic in session.channels if topic not in wanted]
+    others = [topic for topic in session.channels if topic not in present]
     if others:
         notes.append(f"not in the dataset: {some_names(sorted(others), 10)}")
     facts = session.metadata.get("undulog", {})
@@ -205,17 +207,17 @@ def read_episode(session: Session, task: str | None = None) -> tuple[Episode, li
 def _held(
     session: Session, topic: str, joint: str, t_ns: IntArray, values: FloatArray
 ) -> HeldSignal:
-    known = ~np.isnan(values)
+    present = ~np.isnan(values)
     with np.errstate(over="ignore"):
-        rounded = values[known].astype(np.float32)
-    if not known.any():
+        rounded = values[present].astype(np.float32)
+    if not present.any():
         raise DataError(
             f"{session.path}: {topic} has no samples of {joint}, and every frame of a LeRobot "
             "dataset has a value of each joint"
         )
     if not np.isfinite(rounded).all():
         raise DataError(f"{session.path}: {topic}, {joint}: values that are too large for float32")
-    return HeldSignal(joint, t_ns if known.all() else t_ns[known], rounded)
+    return HeldSignal(joint, t_ns if present.all() else t_ns[present], rounded)
 
 
 def _losses(episode: Episode, fps: int) -> Iterator[str]:
@@ -276,9 +278,9 @@ class _Writer:
         """
         self._first = self._first or episode
         for name, joints in {**self._first.names(), **episode.names()}.items():
-            own, first = (each.names().get(name, []) for each in (episode, self._first))
-            if own != first:
-                odd = some_names(sorted({*own} ^ {*first}), 6) or f"another order of {joints[0]}"
+            names, first = (candidate.names().get(name, []) for candidate in (episode, self._first))
+            if names != first:
+                odd = some_names(sorted({*names} ^ {*first}), 6) or f"another order of {joints[0]}"
                 raise DataError(
                     f"session {episode.session_id}: the joints of {name} aren't those of session "
                     f"{self._first.session_id} ({odd}), and all episodes of a dataset have the same"
@@ -306,7 +308,11 @@ class _Writer:
                 "meta/episodes/file_index": 0,
                 "undulog/session_id": episode.session_id,
                 "undulog/start_ns": episode.start_ns,
-                **{f"stats/{name}/{k}": v for name, own in stats.items() for k, v in own.items()},
+                **{
+                    f"stats/{name}/{k}": v
+                    for name, numbers in stats.items()
+                    for k, v in numbers.items()
+                },
             }
         )
         self._frames += count
@@ -387,12 +393,14 @@ class _Writer:
         frame_ns = episode.frame_ns(frames, self._fps)
         columns: dict[str, Any] = {}
         for name, signals in episode.features.items():
-            found = [signal.at(frame_ns) for signal in signals]
+            samples = [signal.at(frame_ns) for signal in signals]
             for key, place in ((name, 1), (f"sample_time.{name}", 0)):
-                flat = self._pa.array(np.stack([each[place] for each in found], axis=1).ravel())
-                one = len(signals) == 1
+                flat = self._pa.array(
+                    np.stack([sample[place] for sample in samples], axis=1).ravel()
+                )
+                single = len(signals) == 1
                 columns[key] = (
-                    flat if one else self._pa.FixedSizeListArray.from_arrays(flat, len(signals))
+                    flat if single else self._pa.FixedSizeListArray.from_arrays(flat, len(signals))
                 )
         return columns
 
@@ -413,8 +421,8 @@ class _Writer:
         for name, signals in episode.features.items():
             pairs = [tuple(map(_stats, signal.at(frame_ns))) for signal in signals]
             for key, place in ((name, 1), (f"sample_time.{name}", 0)):
-                each = [pair[place] for pair in pairs]
-                stats[key] = {stat: [one[stat] for one in each] for stat in each[0]}
+                statistics = [pair[place] for pair in pairs]
+                stats[key] = {stat: [joint[stat] for joint in statistics] for stat in statistics[0]}
                 stats[key]["count"] = [count]
         for name, values in self._numbers(frames, number, task).items():
             stats[name] = {stat: [value] for stat, value in _stats(values).items()}
@@ -445,19 +453,21 @@ def aggregate_stats(stats: Sequence[Mapping[str, Stats]]) -> dict[str, Stats]:
     """
     result: dict[str, Stats] = {}
     for name in stats[0]:
-        own = {key: np.array([each[name][key] for each in stats]) for key in stats[0][name]}
-        weights = own["count"] / own["count"].sum()
-        mean = (weights * own["mean"]).sum(axis=0)
-        variance = (weights * (own["std"] ** 2 + (own["mean"] - mean) ** 2)).sum(axis=0)
-        found = {key: (weights * values).sum(axis=0) for key, values in own.items()}
-        found |= {
-            "min": own["min"].min(axis=0),
-            "max": own["max"].max(axis=0),
+        arrays = {
+            key: np.array([episode[name][key] for episode in stats]) for key in stats[0][name]
+        }
+        weights = arrays["count"] / arrays["count"].sum()
+        mean = (weights * arrays["mean"]).sum(axis=0)
+        variance = (weights * (arrays["std"] ** 2 + (arrays["mean"] - mean) ** 2)).sum(axis=0)
+        merged = {key: (weights * values).sum(axis=0) for key, values in arrays.items()}
+        merged |= {
+            "min": arrays["min"].min(axis=0),
+            "max": arrays["max"].max(axis=0),
             "mean": mean,
             "std": np.sqrt(variance),
-            "count": own["count"].sum(axis=0),
+            "count": arrays["count"].sum(axis=0),
         }
-        result[name] = {key: values.tolist() for key, values in found.items()}
+        result[name] = {key: values.tolist() for key, values in merged.items()}
     return result
 
 

@@ -84,12 +84,12 @@ def read_frames(
     """
     names, *columns = joint_columns(dataset)
     stamped = STAMPS in dataset.numbering
-    wanted = [*FEATURES, *NUMBERING, *([STAMPS] if stamped else [])]
-    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
+    required = [*FEATURES, *NUMBERING, *([STAMPS] if stamped else [])]
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in required}
     size = 0
     for done, path in enumerate(dataset.files()):
         advance(done, path.name)
-        for block in dataset.reader.blocks(path, wanted, ROWS):
+        for block in dataset.reader.blocks(path, required, ROWS):
             for name in NUMBERING:
                 parts[name].append(np.array(integers(path, block, name), dtype=np.int64))
             for feature, chosen in zip(FEATURES, columns, strict=True):

@@ -199,7 +199,13 @@ def import_lerobot(
         source = _episode(dataset, number, present[number], digest)
         column_map, notes = _map(dataset, units or {})
         report = import_tables(
-            source, path, robot=robot, column_map=column_map, said=notes, force=force, stop=stop
+            source,
+            path,
+            robot=robot,
+            column_map=column_map,
+            map_notes=notes,
+            force=force,
+            stop=stop,
         )
         report.robot = robot.name if robot else dataset.robot_type or report.robot
         reports.append(report)
@@ -277,15 +283,15 @@ def _task(dataset: LeRobotDataset, path: Path, number: int) -> str:
     try:
         where = "episode_index", number
         (block,) = dataset.reader.blocks(path, ["task_index"], 1, where=where, most=1)
-        wanted = int(block["task_index"][0])
+        index = int(block["task_index"][0])
         lines = dataset.folder / "meta" / "tasks.jsonl"
         if lines.is_file():
             with lines.open(encoding="utf-8") as stream:
                 entries = (read_json(line) for line in stream if line.strip())
-                return str(next(e["task"] for e in entries if e["task_index"] == wanted))
+                return str(next(e["task"] for e in entries if e["task_index"] == index))
         listing = dataset.folder / "meta" / "tasks.parquet"
         (tasks,) = dataset.reader.blocks(listing, None, _MOST_TASKS, most=1)
         texts = next(values for name, values in tasks.items() if name != "task_index")
-        return str(texts[tasks["task_index"].tolist().index(wanted)])
+        return str(texts[tasks["task_index"].tolist().index(index)])
     except Exception:  # noqa: BLE001 - a text for people only, in files of many makes
         return ""

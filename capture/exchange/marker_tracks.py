@@ -44,8 +44,8 @@ class _Marker:
 
 def is_frame_number(name: str) -> bool:
     """Return whether a column is named as numbers of frames are."""
-    found = words(name)
-    return bool(found) and found[0] in _FRAME
+    parts = words(name)
+    return bool(parts) and parts[0] in _FRAME
 
 
 def as_joints(table: TableFile) -> TableFile | None:
@@ -59,16 +59,16 @@ def as_joints(table: TableFile) -> TableFile | None:
     angles = {f"angle [rad][{name}]": name for name in list(markers)[1:-1]}
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:
-        wanted = [name for name in names if name in kept]
-        for block in table.read([*wanted, *(name for name in used if name)], time):
+        requested = [name for name in names if name in kept]
+        for block in table.read([*requested, *(name for name in used if name)], time):
             try:
                 points = [_points(block, marker) for marker in markers.values()]
             except (ValueError, TypeError) as error:
                 raise ImportFormatError(
                     table.path, f"has a point without numbers: {error}"
                 ) from error
-            found = dict(zip(angles, _turns(np.stack(points)), strict=True))
-            yield {name: found[name] if name in found else block[name] for name in names}
+            turned = dict(zip(angles, _turns(np.stack(points)), strict=True))
+            yield {name: turned[name] if name in turned else block[name] for name in names}
 
     left_out = (*table.left_out, *(name for name in table.columns if name not in kept))
     return replace(
@@ -91,13 +91,13 @@ def with_fps(table: TableFile, fps: float) -> TableFile:
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
         row = 0
-        own = [name for name in names if name != _TIME]
-        source = [*own, *([frames] if frames and frames not in own else [])]
+        values = [name for name in names if name != _TIME]
+        source = [*values, *([frames] if frames and frames not in values else [])]
         for block in table.read(source or list(table.columns[:1]), ""):
             count = len(next(iter(block.values())))
             number = np.arange(row, row + count) if frames is None else block[frames]
             row += count
-            yield {_TIME: _times(table, number, fps)} | {name: block[name] for name in own}
+            yield {_TIME: _times(table, number, fps)} | {name: block[name] for name in values}
 
     columns = tuple(name for name in table.columns if name != frames)
     return replace(table, columns=(_TIME, *columns), read=read)
@@ -111,13 +111,13 @@ def _times(table: TableFile, number: NDArray[Any], fps: float) -> NDArray[np.int
 
 def _markers(columns: Sequence[str]) -> dict[str, _Marker]:
     """Return the markers in the order of their first columns."""
-    found: dict[str, dict[str, str]] = {}
+    markers: dict[str, dict[str, str]] = {}
     for name in columns:
         match = _BEHIND.fullmatch(name) or _BEFORE.fullmatch(name)
         if match is not None:
             marker = match["marker"]
             marker = f"marker{marker}" if marker.isdigit() else marker
-            found.setdefault(marker, {}).setdefault(match["axis"].lower(), name)
+            markers.setdefault(marker, {}).setdefault(match["axis"].lower(), name)
     likely = {
         stem: name
         for name in columns
@@ -125,7 +125,7 @@ def _markers(columns: Sequence[str]) -> dict[str, _Marker]:
     }
     return {
         marker: _Marker(axes["x"], axes["y"], likely.get(marker))
-        for marker, axes in found.items()
+        for marker, axes in markers.items()
         if axes.keys() == {"x", "y"}
     }
 

@@ -243,7 +243,7 @@ class _Reader:
         def column(name: str, *, converted: bool = False) -> NDArray[Any] | None:
             if name not in group.channels:
                 return None
-            found, _ = self._mdf.get(
+            samples, _ = self._mdf.get(
                 group=group.index,
                 index=group.channels[name],
                 raw=not converted,
@@ -251,17 +251,17 @@ class _Reader:
                 record_offset=first,
                 record_count=count,
             )
-            if len(found) != count:
-                raise ValueError(f"{group.kind}.{name} has {len(found)} of {count} values")
-            return np.asarray(found)
+            if len(samples) != count:
+                raise ValueError(f"{group.kind}.{name} has {len(samples)} of {count} values")
+            return np.asarray(samples)
 
         def numbers(name: str) -> IntArray | None:
-            found = column(name)
-            return None if found is None else found.astype(np.int64)
+            values = column(name)
+            return None if values is None else values.astype(np.int64)
 
         frames = empty_fd_frames(count)
         none = np.zeros(count, dtype=np.int64)
-        identifier = none if (found := numbers("ID")) is None else found
+        identifier = none if (logged := numbers("ID")) is None else logged
         extended = identifier & wire.EXTENDED_FLAG != 0
         if (wide := numbers("IDE")) is not None:
             extended |= wide != 0
@@ -283,7 +283,7 @@ class _Reader:
             cells = cells * (_PLACES[: cells.shape[1]] < size[:, None])
             frames["data"][:, : cells.shape[1]] = cells
         frames["dir"] = _ways(column("Dir", converted=True), count)
-        bus = none if (found := numbers("BusChannel")) is None else found
+        bus = none if (logged := numbers("BusChannel")) is None else logged
         return LogBlock(frames, bus, is_fd)
 
 
@@ -296,8 +296,8 @@ def _fd_facts(
         is_fd |= longer != 0
     is_fd &= kind != "CAN_ErrorFrame"
     for name, flag in (("BRS", wire.FD_BRS), ("ESI", wire.FD_ESI)):
-        if (found := numbers(name)) is not None:
-            flags[is_fd & (found != 0)] |= flag
+        if (values := numbers(name)) is not None:
+            flags[is_fd & (values != 0)] |= flag
     return is_fd, flags
 
 
@@ -331,10 +331,10 @@ def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> It
 
 def _indices(numbers: IntArray, log: FrameLog) -> IntArray:
     """Return indices of buses by their numbers; a new bus is added, in order of appearance."""
-    found, first, which = np.unique(numbers, return_index=True, return_inverse=True)
-    indices = np.empty(len(found), dtype=np.int64)
+    buses, first, which = np.unique(numbers, return_index=True, return_inverse=True)
+    indices = np.empty(len(buses), dtype=np.int64)
     for k in np.argsort(first):
-        indices[k] = log.bus_index(f"can{found[k]}")
+        indices[k] = log.bus_index(f"can{buses[k]}")
     return indices[which]
 
 

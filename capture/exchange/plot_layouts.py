@@ -141,13 +141,13 @@ def _plots(
     """Return the plots of a session, its length [s], and the report to fill."""
     usual = [JOINT_TOPIC[Quantity.COMMAND], JOINT_TOPIC[Quantity.POSITION]]
     with Session.open(source, column_folder=output.parent) as session:
-        wanted = list(dict.fromkeys(topics)) or [t for t in usual if t in session.channels]
-        if not wanted:
+        plotted = list(dict.fromkeys(topics)) or [t for t in usual if t in session.channels]
+        if not plotted:
             missing = " and no ".join(usual)
             raise MissingChannelError(source, missing, sorted(session.channels))
-        read = session.joint_columns({topic: ["position"] for topic in wanted})
+        read = session.joint_columns({topic: ["position"] for topic in plotted})
         curves: dict[str, list[TopicCurve]] = {}
-        for number, topic in enumerate(wanted):
+        for number, topic in enumerate(plotted):
             signals = read[topic, "position"]
             places = _places(session.joint_orders(topic))
             color = _COLORS[number % len(_COLORS)]

@@ -177,8 +177,8 @@ def _yaml(value: Any, indent: str = "") -> Iterator[str]:
     """Yield the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
     if isinstance(value, list):
         for item in cast("list[Any]", value):
-            own = [*_yaml(item, indent + "  ")] if isinstance(item, dict) else [json.dumps(item)]
-            yield from (f"{indent}- {own[0].strip()}", *own[1:])
+            lines = [*_yaml(item, indent + "  ")] if isinstance(item, dict) else [json.dumps(item)]
+            yield from (f"{indent}- {lines[0].strip()}", *lines[1:])
         return
     for key, item in cast("dict[str, Any]", value).items():
         if item and isinstance(item, dict | list):

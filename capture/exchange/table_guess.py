@@ -67,12 +67,12 @@ class Guess:
     """A map that was guessed.
 
     Attributes:
-        said: What was taken for what and why, one sentence each.
+        notes: What was taken for what and why, one sentence each.
         left_out: Columns without a place.
     """
 
     column_map: ColumnMap
-    said: list[str] = field(default_factory=list[str])
+    notes: list[str] = field(default_factory=list[str])
     left_out: list[str] = field(default_factory=list[str])
 
 
@@ -100,8 +100,8 @@ def parse_units(options: Sequence[str]) -> dict[str, str]:
         elif name in JOINT_QUANTITIES:
             valid = valid_units(Quantity(name))
         else:
-            known = ", ".join(["time", *JOINT_QUANTITIES])
-            raise UsageError(f"--unit {option!r} is not QUANTITY=UNIT; quantities: {known}")
+            quantities = ", ".join(["time", *JOINT_QUANTITIES])
+            raise UsageError(f"--unit {option!r} is not QUANTITY=UNIT; quantities: {quantities}")
         if unit not in valid:
             raise UsageError(f"--unit {option!r}: valid for {name}: {', '.join(valid)}")
         units[name] = unit
@@ -121,35 +121,35 @@ def guess_map(
     Raises:
         ImportFormatError: If there is no column of times or none of a joint.
     """
-    said: list[str] = []
+    notes: list[str] = []
     left_out: list[str] = []
-    found: list[tuple[str, str, _Name]] = []
+    entries: list[tuple[str, str, _Name]] = []
     times: dict[str, tuple[str, str]] = {}
     samples: dict[str, Block] = {}
     for role, table in tables.items():
         samples[role] = sample = table.sample()
         left_out += table.left_out
         time = _time_column(table, sample)
-        times[role] = (time, _time_unit(table, time, sample[time], units, said))
+        times[role] = (time, _time_unit(table, time, sample[time], units, notes))
         for name in (name for name in table.columns if name != time):
             meaning = _meaning(name, role, headerless=table.form == "headerless")
             if meaning.quantity is None or not _numeric(sample[name]):
                 left_out.append(name)
             else:
-                found.append((role, name, meaning))
+                entries.append((role, name, meaning))
     first = next(iter(tables.values()))
-    if not found:
+    if not entries:
         raise ImportFormatError(
             first.path,
             "no column is named as a position, command, velocity, torque, current, voltage or "
             f"temperature; name them by --columns or --map. It has {some_names(first.columns, 20)}",
         )
-    names = _joint_names(found, joints, first.path, said)
-    columns = _columns(found, names, units, samples, said, left_out)
+    names = _joint_names(entries, joints, first.path, notes)
+    columns = _columns(entries, names, units, samples, notes, left_out)
     main = times.get(STATES) or times[COMMANDS]
-    own = times.get(COMMANDS)
-    commands_time = own if own is not None and own != main else None
-    return Guess(ColumnMap(*main, tuple(columns), first.delimiter, commands_time), said, left_out)
+    separate = times.get(COMMANDS)
+    commands_time = separate if separate is not None and separate != main else None
+    return Guess(ColumnMap(*main, tuple(columns), first.delimiter, commands_time), notes, left_out)
 
 
 def _numeric(cells: NDArray[Any]) -> bool:
@@ -178,21 +178,21 @@ def _rises(cells: NDArray[Any]) -> bool:
 
 
 def _time_unit(
-    table: TableFile, name: str, cells: NDArray[Any], units: Mapping[str, str], said: list[str]
+    table: TableFile, name: str, cells: NDArray[Any], units: Mapping[str, str], notes: list[str]
 ) -> str:
     """Return the unit of times: given, named, or that whose rate is nearest 100 Hz."""
     if given := units.get("time") or _named_unit(name, tuple(TIME_UNITS)):
         return given
     if not _numeric(cells):
         raise ImportFormatError(table.path, f"column {name!r} holds no numbers, so no times")
-    known = np.unique(cells[np.abs(cells.astype(float)) < LATEST_NS]).astype(float)
-    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    stamps = np.unique(cells[np.abs(cells.astype(float)) < LATEST_NS]).astype(float)
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     if step <= 0:
-        said.append(f"{table.path.name}: times ({name}) taken as s: no unit given")
+        notes.append(f"{table.path.name}: times ({name}) taken as s: no unit given")
         return "s"
     rates = {unit: 1e9 / (step * ns) for unit, ns in TIME_UNITS.items()}
     unit = min(rates, key=lambda u: abs(math.log(rates[u] / _USUAL_HZ)))
-    said.append(
+    notes.append(
         f"{table.path.name}: times ({name}) taken as {unit}: no unit given; {step:g} from row to "
         f"row is {rates[unit]:.4g} Hz (--unit time=UNIT overrides)"
     )
@@ -222,9 +222,9 @@ def _meaning(name: str, role: str, *, headerless: bool) -> _Name:
     base = name[: pivot.start()] if pivot and place else name
     unit = _named_unit(base, tuple(UNITS))
     plain = re.sub(r"[\[(][^\[\]()]*[\])]", "", base)
-    found = words(plain)
-    commanded = role == COMMANDS or bool(_COMMAND.intersection(found))
-    quantities = [_QUANTITY[word] for word in found if word in _QUANTITY]
+    parts = words(plain)
+    commanded = role == COMMANDS or bool(_COMMAND.intersection(parts))
+    quantities = [_QUANTITY[word] for word in parts if word in _QUANTITY]
     specific = [quantity for quantity in quantities if quantity is not Quantity.POSITION]
     measured = (specific or quantities or [None])[0]
     if commanded and measured in {None, Quantity.POSITION}:
@@ -264,10 +264,10 @@ def _identifier(text: str) -> str:
 
 
 def _joint_names(
-    found: Sequence[tuple[str, str, _Name]], joints: Sequence[str], path: Path, said: list[str]
+    entries: Sequence[tuple[str, str, _Name]], joints: Sequence[str], path: Path, notes: list[str]
 ) -> list[str]:
     """Return the names of joints that columns have by number only."""
-    indices = [meaning.index for _, _, meaning in found if meaning.index is not None]
+    indices = [meaning.index for _, _, meaning in entries if meaning.index is not None]
     count = max(indices, default=-1) + 1
     if count > WIDEST:
         raise ImportFormatError(path, f"has a joint of the number {count - 1}; {WIDEST} at most")
@@ -275,23 +275,23 @@ def _joint_names(
         raise ImportFormatError(path, f"has {count} joints, the list of names {len(joints)}")
     if joints or not count:
         return list(joints)
-    said.append(f"joints named joint01 to joint{count:02d} in the order of the columns")
+    notes.append(f"joints named joint01 to joint{count:02d} in the order of the columns")
     return numbered("joint", count)
 
 
 def _columns(  # noqa: PLR0917 - each is filled or read here
-    found: Sequence[tuple[str, str, _Name]],
+    entries: Sequence[tuple[str, str, _Name]],
     names: Sequence[str],
     units: Mapping[str, str],
     samples: Mapping[str, Block],
-    said: list[str],
+    notes: list[str],
     left_out: list[str],
 ) -> list[MappedColumn]:
     columns: list[MappedColumn] = []
     taken: dict[tuple[str, Quantity], str] = {}
     assumed: dict[Quantity, str] = {}
-    single = _single_joint(found, names)
-    for role, name, meaning in found:
+    single = _single_joint(entries, names)
+    for role, name, meaning in entries:
         quantity = meaning.quantity
         if quantity is None:
             continue
@@ -300,7 +300,7 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
             joint = names[meaning.index]
         if (joint, quantity) in taken:
             left_out.append(name)
-            said.append(f"{name} left out: a second {quantity} of {joint} beside "
+            notes.append(f"{name} left out: a second {quantity} of {joint} beside "
                         f"{taken[joint, quantity]}")  # fmt: skip
             continue
         taken[joint, quantity] = name
@@ -312,9 +312,9 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
         stated = _STATED.fullmatch(name) is not None
         wrap = 0.0 if stated else _wrap(samples[role][name], quantity, unit)
         if wrap:
-            said.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
+            notes.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
         columns.append(MappedColumn(name, joint, quantity, unit, wrap=wrap, table=role))
-    said += [
+    notes += [
         f"{_PLURAL.get(quantity, f'{quantity}s')} taken as {unit}: no unit given "
         f"(--unit {quantity}=UNIT overrides)"
         for quantity, unit in assumed.items()
@@ -323,11 +323,11 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
 
 
 def _single_joint(
-    found: Sequence[tuple[str, str, _Name]],
+    entries: Sequence[tuple[str, str, _Name]],
     names: Sequence[str],
 ) -> str:
     """Return the name of the joint that columns without a name belong to."""
-    named = {meaning.joint for _, _, meaning in found if meaning.joint}
+    named = {meaning.joint for _, _, meaning in entries if meaning.joint}
     if len(names) == 1:
         return names[0]
     return next(iter(named)) if len(named) == 1 else "joint01"

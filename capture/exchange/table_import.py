@@ -126,38 +126,38 @@ def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
 
 
 def _open_folder(folder: Path) -> TableSet:
-    found: dict[str, list[Path]] = {STATES: [], COMMANDS: [], "events": [], "names": []}
+    by_role: dict[str, list[Path]] = {STATES: [], COMMANDS: [], "events": [], "names": []}
     others: list[str] = []
     for path in sorted(folder.iterdir()):
-        said = set(words(path.stem))
-        if path.suffix.lower() == ".txt" and {"list", "names"} & said:
-            found["names"].append(path)
+        labels = set(words(path.stem))
+        if path.suffix.lower() == ".txt" and {"list", "names"} & labels:
+            by_role["names"].append(path)
         elif path.suffix.lower() not in TABLE_SUFFIXES:
             others.append(path.name)
-        elif said & _EVENT_FILES:
-            found["events"].append(path)
-        elif said & _COMMAND_FILES:
-            found[COMMANDS].append(path)
-        elif said & _STATE_FILES:
-            found[STATES].append(path)
+        elif labels & _EVENT_FILES:
+            by_role["events"].append(path)
+        elif labels & _COMMAND_FILES:
+            by_role[COMMANDS].append(path)
+        elif labels & _STATE_FILES:
+            by_role[STATES].append(path)
         else:
             others.append(path.name)
     for role in (STATES, COMMANDS):
-        if len(found[role]) > 1:
-            names = ", ".join(path.name for path in found[role])
+        if len(by_role[role]) > 1:
+            names = ", ".join(path.name for path in by_role[role])
             raise ImportFormatError(
                 folder, f"has several tables of {role}: {names}; give one, and --commands"
             )
-    tables = {role: open_table(found[role][0]) for role in (STATES, COMMANDS) if found[role]}
+    tables = {role: open_table(by_role[role][0]) for role in (STATES, COMMANDS) if by_role[role]}
     if not tables:
         raise ImportFormatError(
             folder,
             "has no table named as states or commands (state*.csv, control.csv); it has "
             f"{some_names(others, 10) or 'nothing'}",
         )
-    events = found["events"][0] if found["events"] else None
-    files = [path for paths in found.values() for path in paths]
-    joints = _names(found["names"][0]) if found["names"] else ()
+    events = by_role["events"][0] if by_role["events"] else None
+    files = [path for paths in by_role.values() for path in paths]
+    joints = _names(by_role["names"][0]) if by_role["names"] else ()
     return TableSet(folder, tables, partial(digest_of, files), joints, events, tuple(others))
 
 
@@ -173,13 +173,13 @@ def _names(path: Path) -> tuple[str, ...]:
 
 
 def import_tables(
-    found: TableSet,
+    table_set: TableSet,
     output: Path,
     *,
     robot: Robot | None = None,
     column_map: ColumnMap | None = None,
     units: Mapping[str, str] | None = None,
-    said: Sequence[str] = (),
+    map_notes: Sequence[str] = (),
     write_map: Path | None = None,
     force: bool = False,
     stop: StopRequest | None = None,
@@ -190,7 +190,7 @@ def import_tables(
         robot: The robot that made them; without it joints are named by the columns.
         column_map: What the columns mean; guessed if None.
         units: Quantity, or ``time``, to unit, for the guess.
-        said: Notes on a map that is given.
+        map_notes: Notes on a map that is given.
         write_map: Where to write the map.
         stop: Ends the import early, with a whole file of what was written so far.
 
@@ -202,29 +202,29 @@ def import_tables(
     if write_map is not None:
         refuse_existing(write_map, force=force)
     refuse_existing(output, force=force)
-    notes: list[str] = list(said)
+    notes: list[str] = list(map_notes)
     if column_map is None:
-        joints = found.joints or (robot.joint_names if robot else ())
-        guess = guess_map(found.tables, joints, units or {})
-        column_map, notes = guess.column_map, [*map_lines(guess.column_map), *guess.said]
+        joints = table_set.joints or (robot.joint_names if robot else ())
+        guess = guess_map(table_set.tables, joints, units or {})
+        column_map, notes = guess.column_map, [*map_lines(guess.column_map), *guess.notes]
         if guess.left_out:
             names = list(dict.fromkeys(name.partition("[")[0] for name in guess.left_out))
             notes.append(f"columns without a place left out: {some_names(names, 20)}")
-    notes += [f"file left out: {name}" for name in found.left_out]
+    notes += [f"file left out: {name}" for name in table_set.left_out]
     if write_map is not None:
         write_text(write_map, column_map.toml())
         notes.append(f"map written to {write_map}; edit it and give it back by --columns")
-    unknown = {column.table for column in column_map.columns} - found.tables.keys()
+    unknown = {column.table for column in column_map.columns} - table_set.tables.keys()
     if unknown:
         raise UsageError(f"the map has columns of {', '.join(unknown)}, but no such table is given")
-    report = ImportReport(found.source, output, robot.name if robot else "unknown robot")
+    report = ImportReport(table_set.source, output, robot.name if robot else "unknown robot")
     report.notes = notes
-    _write(found, column_map, robot, report, force=force, stop=stop)
+    _write(table_set, column_map, robot, report, force=force, stop=stop)
     return report
 
 
 def _write(
-    found: TableSet,
+    table_set: TableSet,
     column_map: ColumnMap,
     robot: Robot | None,
     report: ImportReport,
@@ -234,7 +234,7 @@ def _write(
 ) -> None:
     sources = [
         source
-        for role, table in found.tables.items()
+        for role, table in table_set.tables.items()
         if (source := _Source(table, role, column_map)).columns
     ]
     first_ns = min(source.first_ns() for source in sources)
@@ -242,27 +242,27 @@ def _write(
     offset = RELATIVE_EPOCH_NS if relative else 0
     report.start_ns = report.end_ns = first_ns + offset
     if report.start_ns < 0:
-        raise ImportFormatError(found.source, "not all times are from 1970 to 2038")
-    form = next(iter(found.tables.values()))
+        raise ImportFormatError(table_set.source, "not all times are from 1970 to 2038")
+    form = next(iter(table_set.tables.values()))
     facts = {
         "import.format": form.path.suffix.removeprefix(".").lower() or "csv",
         "import.time": "counted from the log's start, put at 2000-01-01T00:00:00Z"
         if relative
         else "as recorded",
-        **found.facts,
+        **table_set.facts,
     }
     with (
         imported_session(
-            found.source, report.output, robot, epoch_ns=report.start_ns, facts=facts, force=force,
-            digest=found.digest, compression=found.compression,
+            table_set.source, report.output, robot, epoch_ns=report.start_ns, facts=facts,
+            force=force, digest=table_set.digest, compression=table_set.compression,
         ) as writer,
-        progress(f"import {found.source.name}", 1.0) as bar,
+        progress(f"import {table_set.source.name}", 1.0) as bar,
     ):  # fmt: skip
         writer.attach("columns.toml", "application/toml", column_map.toml().encode())
         streams = [source.messages(writer, offset, report) for source in sources]
-        if found.events is not None:
-            unit = column_map.time_of(COMMANDS if COMMANDS in found.tables else STATES)[1]
-            streams.append(_events(found.events, unit, offset, writer, report))
+        if table_set.events is not None:
+            unit = column_map.time_of(COMMANDS if COMMANDS in table_set.tables else STATES)[1]
+            streams.append(_events(table_set.events, unit, offset, writer, report))
         for block in heapq.merge(*streams, key=lambda block: block.first):
             block.write()
             report.end_ns = max(report.end_ns, block.last_ns)
@@ -271,7 +271,7 @@ def _write(
                 report.complete = False
                 break
         if not report.samples:
-            raise ImportFormatError(found.source, "has no row with a value of a mapped column")
+            raise ImportFormatError(table_set.source, "has no row with a value of a mapped column")
         for source in sources:
             report.notes += source.missing()
         writer.set_verdict(report.verdict, [*report.problems, *report.notes])
@@ -296,13 +296,13 @@ class _Source:
         self.columns = [column for column in column_map.columns if column.table == role]
         self._time, unit = column_map.time_of(role)
         self._unit_ns = TIME_UNITS[unit]
-        wanted = [self._time, *(column.column for column in self.columns)]
-        for name in wanted if self.columns else ():
+        names = [self._time, *(column.column for column in self.columns)]
+        for name in names if self.columns else ():
             if name not in table.columns:
                 raise ImportFormatError(
                     table.path, f"has no column {name!r}; it has {some_names(table.columns, 20)}"
                 )
-        self._wanted = list(dict.fromkeys(wanted))
+        self._wanted = list(dict.fromkeys(names))
         self._order = 0 if role == COMMANDS else 1
         self._last_ns: int | None = None
         self._unwrapped: dict[str, tuple[float, float]] = {}
@@ -321,12 +321,12 @@ class _Source:
         self, writer: SessionWriter, offset: int, report: ImportReport
     ) -> Iterator[_Messages]:
         """Yield the messages of each block, in order of time."""
-        found = {(column.joint, column.quantity): column for column in self.columns}
+        mapping = {(column.joint, column.quantity): column for column in self.columns}
         columns: dict[Quantity, list[MappedColumn]] = {}
-        for (_, quantity), column in found.items():
+        for (_, quantity), column in mapping.items():
             columns.setdefault(quantity, []).append(column)
         topics = [
-            JointTopic(writer, list(found), quantities) for quantities in topics_of(set(columns))
+            JointTopic(writer, list(mapping), quantities) for quantities in topics_of(set(columns))
         ]
         for block in self._blocks:
             if not len(block[self._time]):
@@ -392,15 +392,15 @@ class _Source:
         changed = [k for k, column in enumerate(columns) if not column.is_plain]
         values: FloatArray = joined(cells)
         if not -_MOST < float(values.min()) <= float(values.max()) < _MOST:
-            known = ~np.isnan(values)
-            for column, own, there in zip(columns, values.T, known.T, strict=True):
-                if not np.all(np.abs(own[there]) < _MOST):
+            present = ~np.isnan(values)
+            for column, numbers, there in zip(columns, values.T, present.T, strict=True):
+                if not np.all(np.abs(numbers[there]) < _MOST):
                     raise ImportFormatError(
                         self.table.path,
                         f"column {column.column!r} has a number that is not finite or beyond "
                         f"{_MOST:g}",
                     )
-                missing = self._missing.get(column.column, 0) + int(len(own) - there.sum())
+                missing = self._missing.get(column.column, 0) + int(len(numbers) - there.sum())
                 self._missing[column.column] = missing
         if changed:
             values = values.astype(np.float64)
@@ -421,13 +421,13 @@ class _Source:
 
     def _in_unit(self, column: MappedColumn, values: FloatArray) -> FloatArray:
         """Convert numbers to the session's unit: unwrapped over blocks, scaled and offset."""
-        known = ~np.isnan(values)
-        if column.wrap and known.any():
-            raw = values[known]
+        present = ~np.isnan(values)
+        if column.wrap and present.any():
+            raw = values[present]
             before = self._unwrapped.get(column.column, (raw[0], raw[0]))
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
-            values[known] = turns[1:] + (before[1] - before[0])
-            self._unwrapped[column.column] = (raw[-1], values[known][-1])
+            values[present] = turns[1:] + (before[1] - before[0])
+            self._unwrapped[column.column] = (raw[-1], values[present][-1])
         scaled = values if column.scale == 1.0 else column.scale * values
         unit = unit_for(column.unit, column.quantity)
         return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
@@ -480,13 +480,13 @@ def _events(
         raise ImportFormatError(path, "has no column of times")
     text = next((i for i, name in enumerate(head) if "event" in words(name)), len(head) - 1)
     log = writer.log()
-    found: list[tuple[int, str]] = []
+    events: list[tuple[int, str]] = []
     for row in rows[1:]:
         try:
             t_ns = _exact_ns(row[time], TIME_UNITS[unit]) + offset
             if not 0 <= t_ns < LATEST_NS:
                 raise ImportFormatError(path, f"{row[time]!r} is no time before 2038")
-            found.append((t_ns, row[text]))
+            events.append((t_ns, row[text]))
         except (ArithmeticError, LookupError) as error:
             raise ImportFormatError(path, f"row {row!r} has no time and event") from error
 
@@ -497,5 +497,5 @@ def _events(
 
         return write
 
-    for t_ns, event in sorted(found):
+    for t_ns, event in sorted(events):
         yield _Messages((t_ns, 2), t_ns, writing(t_ns, event))

@@ -100,8 +100,8 @@ def open_csv(path: Path, time: str, columns: Sequence[str], delimiter: str) -> T
         header = [name.strip() for name in next(rows, list[str]())]
     for name in (time, *columns):
         if header.count(name) != 1:
-            found = f"{header.count(name)} columns" if name in header else "no column"
-            raise ImportFormatError(path, f"has {found} {name!r}; it has {listed(header, name)}")
+            actual = f"{header.count(name)} columns" if name in header else "no column"
+            raise ImportFormatError(path, f"has {actual} {name!r}; it has {listed(header, name)}")
     return TableFile(path, (time, *columns), partial(_read_csv, path, header, delimiter), delimiter)
 
 
@@ -188,16 +188,18 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     plain = {
         name: np.squeeze(array) for name, array in arrays.items() if array.dtype.kind in "fiub"
     }
-    plain = {name: each for name, each in plain.items() if each.ndim in {1, 2} and each.size > 1}
+    plain = {
+        name: array for name, array in plain.items() if array.ndim in {1, 2} and array.size > 1
+    }
     if not plain:
         raise ImportFormatError(path, "holds no arrays of numbers with one or two dimensions")
-    vectors = [each.shape[0] for each in plain.values() if each.ndim == 1]
-    lengths = [max(each.shape) for each in plain.values()]
+    vectors = [array.shape[0] for array in plain.values() if array.ndim == 1]
+    lengths = [max(array.shape) for array in plain.values()]
     rows = max(vectors or lengths, key=lambda n: (lengths.count(n), n))
     check_rows(path, rows)
     columns: Block = {}
-    for name, each in plain.items():
-        upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
+    for name, column in plain.items():
+        upright = column.T if column.ndim == 2 and column.shape[0] != rows else column
         if upright.shape[0] != rows or math.prod(upright.shape[1:]) > WIDEST:
             continue
         if upright.ndim == 1:
@@ -262,9 +264,11 @@ def _open_text(path: Path) -> TableFile:
         if cell.strip().startswith(("[", "("))
     }
     columns = tuple(
-        each
+        column
         for name in raw
-        for each in ([f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name])
+        for column in (
+            [f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name]
+        )
     )
     if len(columns) > WIDEST:
         refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
@@ -330,13 +334,13 @@ def _read_text(  # noqa: PLR0917 - bound once, where the file was sniffed
     names: Sequence[str],
     time: str,
 ) -> Iterator[Block]:
-    wanted = [name for name in raw if name in names or f"{name}[0]" in names]
-    texts = {name: str for name in (*vectors, time) if name in wanted}
+    selected = [name for name in raw if name in names or f"{name}[0]" in names]
+    texts = {name: str for name in (*vectors, time) if name in selected}
     step = rows_of_block(len(raw) + sum(vectors.values()))
     try:
         with pd.read_csv(  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
             path, sep=r"\s+" if delimiter == " " else delimiter, decimal=decimal, names=raw,
-            header=None, skiprows=skipped, usecols=wanted, dtype=cast("Any", texts),
+            header=None, skiprows=skipped, usecols=selected, dtype=cast("Any", texts),
             chunksize=step, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
             low_memory=False, on_bad_lines="error",
         ) as chunks:  # fmt: skip
@@ -404,10 +408,10 @@ def _pivoted(table: TableFile) -> TableFile | None:
     if time is None or not values:
         return None
 
-    def read(wanted: Sequence[str], exact: str) -> Iterator[Block]:  # noqa: ARG001
-        present = [value for value in values if any(n.startswith(f"{value}[") for n in wanted)]
+    def read(requested: Sequence[str], exact: str) -> Iterator[Block]:  # noqa: ARG001
+        present = [value for value in values if any(n.startswith(f"{value}[") for n in requested)]
         blocks = list(table.read([time, joint, *present], ""))
-        yield from _wide(table.path, blocks, (time, joint, *present), wanted)
+        yield from _wide(table.path, blocks, (time, joint, *present), requested)
 
     seen: dict[str, None] = {}
     for block in table.read([joint], ""):
@@ -420,13 +424,13 @@ def _pivoted(table: TableFile) -> TableFile | None:
 
 
 def _wide(
-    path: Path, blocks: list[Block], columns: Sequence[str], wanted: Sequence[str]
+    path: Path, blocks: list[Block], columns: Sequence[str], requested: Sequence[str]
 ) -> Iterator[Block]:
     """Put the rows of one time side by side; the table is held whole, in order of time.
 
     Args:
         columns: Of the times, of the joints, and of the values.
-        wanted: The columns to yield.
+        requested: The columns to yield.
     """
     t, who, *cells = (np.concatenate([block[name] for block in blocks]) for name in columns)
     stamps, row = np.unique(t, return_inverse=True)
@@ -441,10 +445,10 @@ def _wide(
         block: Block = {columns[0]: stamps[at : at + step]}
         for value, numbers in zip(columns[2:], cells, strict=True):
             dense = np.full((len(block[columns[0]]), len(names)), np.nan)
-            known = mine[~np.isnan(numbers[mine].astype(float))]
-            dense[row[known] - at, codes[known]] = numbers[known]
+            present = mine[~np.isnan(numbers[mine].astype(float))]
+            dense[row[present] - at, codes[present]] = numbers[present]
             block |= {f"{value}[{name}]": dense[:, i] for i, name in enumerate(names)}
-        yield {name: block[name] for name in wanted}
+        yield {name: block[name] for name in requested}
 
 
 def words(name: str) -> list[str]:
@@ -455,5 +459,5 @@ def words(name: str) -> list[str]:
 
 def is_time(name: str) -> bool:
     """Return whether a column is named as times are."""
-    found = words(re.sub(r"[\[(].*", "", name))
-    return bool(found) and found[0] in _TIMES
+    parts = words(re.sub(r"[\[(].*", "", name))
+    return bool(parts) and parts[0] in _TIMES

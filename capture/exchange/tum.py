@@ -146,18 +146,18 @@ def read_trajectory(session: Session, frame: str | None = None) -> PoseTrajector
     moved = [topic for topic, kind in kinds.items() if kind == _TRANSFORMS]
     if not posed and not moved:
         raise MissingChannelError(session.path, "poses", sorted(kinds))
-    known: list[str] = []
+    frames: list[str] = []
     for topic in posed:
-        for found in _of_poses(session, topic, kinds[topic]):
-            if frame is None or found.frame == frame:
-                return found
-            known.append(found.frame)
-    found, others = _of_transforms(session, moved, frame)
-    if found is None:
-        names = some_names(sorted({*known, *others}), 40)
+        for trajectory in _of_poses(session, topic, kinds[topic]):
+            if frame is None or trajectory.frame == frame:
+                return trajectory
+            frames.append(trajectory.frame)
+    trajectory, others = _of_transforms(session, moved, frame)
+    if trajectory is None:
+        names = some_names(sorted({*frames, *others}), 40)
         asked = "no Odometry, so name one (--frame)" if frame is None else f"no frame {frame!r}"
         raise DataError(f"{session.path}: has {asked}; it has {names}")
-    return found
+    return trajectory
 
 
 def _of_poses(session: Session, topic: str, kind: str) -> Iterator[PoseTrajectory]:
@@ -174,8 +174,8 @@ def _of_poses(session: Session, topic: str, kind: str) -> Iterator[PoseTrajector
     t_ns = table.index.to_numpy(dtype=np.int64)
     for child in dict.fromkeys(children.tolist()):
         mine = children == child
-        own = tuple(dict.fromkeys(parents[mine].tolist()))
-        yield PoseTrajectory(topic, str(child), own, t_ns[mine], poses[mine])
+        references = tuple(dict.fromkeys(parents[mine].tolist()))
+        yield PoseTrajectory(topic, str(child), references, t_ns[mine], poses[mine])
 
 
 def _of_transforms(

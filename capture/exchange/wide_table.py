@@ -84,7 +84,7 @@ def wide_blocks(columns: Sequence[WideColumn], cells: int = _MOST_CELLS) -> Iter
     sampled: dict[int, list[WideColumn]] = {}
     for column in columns:
         sampled.setdefault(id(column.t_ns), []).append(column)
-    left: list[IntArray] = [own[0].t_ns for own in sampled.values()]
+    left: list[IntArray] = [group[0].t_ns for group in sampled.values()]
     at = dict.fromkeys(sampled, 0)
     total, done = sum(map(len, left)), 0
     most = max(1, cells // max(len(columns), 1))
@@ -93,12 +93,12 @@ def wide_blocks(columns: Sequence[WideColumn], cells: int = _MOST_CELLS) -> Iter
         t_ns, rows = _rows(list(zip(left, parts, strict=True)))
         done += sum(part.stop - part.start for part in parts)
         at |= {id(t): part.stop for t, part in zip(left, parts, strict=True)}
-        found = {
+        filled = {
             column.name: (row, column.values[part])
             for t, part, row in zip(left, parts, rows, strict=True)
             for column in (sampled[id(t)] if len(row) else ())
         }
-        yield WideBlock(t_ns, found, done / total)
+        yield WideBlock(t_ns, filled, done / total)
 
 
 def _parts(times: Sequence[IntArray], at: Mapping[int, int], most: int) -> list[slice]:
@@ -223,9 +223,11 @@ def wide_columns(
         DataError: If a topic is not of JointStates, has no samples, or two columns would have one
             name.
     """
-    wanted = {topic: list(joint_fields(session, topic)) for topic in joint_topics(session, topics)}
-    warnings = [f"{topic} carries no values" for topic, fields in wanted.items() if not fields]
-    read = session.joint_columns({topic: fields for topic, fields in wanted.items() if fields})
+    by_topic = {
+        topic: list(joint_fields(session, topic)) for topic in joint_topics(session, topics)
+    }
+    warnings = [f"{topic} carries no values" for topic, fields in by_topic.items() if not fields]
+    read = session.joint_columns({topic: fields for topic, fields in by_topic.items() if fields})
     columns: dict[str, WideColumn] = {}
     unknown: list[str] = []
     for (topic, part), signals in read.items():
@@ -245,7 +247,7 @@ def wide_columns(
             if len(t_ns):
                 columns[name] = WideColumn(name, t_ns, values)
     if not columns:
-        raise DataError(f"{session.path}: {some_names(list(wanted), 10)} carry no values")
+        raise DataError(f"{session.path}: {some_names(list(by_topic), 10)} carry no values")
     if len(columns) > _MOST_COLUMNS:
         raise UsageError(
             f"{session.path} has {len(columns)} joint columns; a wide table takes at most "
