@@ -245,8 +245,8 @@ def recover_log(
     refuse_output(output, [path], force=force)
     stop = stop or StopRequest()
     with RawLog(path) as source:
-        found = source.file.recovered
-        if found is not None and found.live:
+        recovered = source.file.recovered
+        if recovered is not None and recovered.live:
             raise LogError(path, "this recording is running; end it first")
         source.warnings = [text.partition(RECOVER)[0] for text in source.warnings]
         with edited_log([source], output, force=force, stop=stop) as log:
@@ -271,16 +271,16 @@ def recover_log(
                 sources=[{**source.facts, "path": str(path)} for path in source.paths],
                 **log.measures(),
                 warnings=source.warnings,
-                from_wal=found.from_wal if found is not None else 0,
+                from_wal=recovered.from_wal if recovered is not None else 0,
                 missing=_missing(source, log),
             )
             _note(source, log, report)
         cut = any(file.cut for file in source.file.files)
     first = first_part(path)
     wal = wal_folder(first)
-    if found is None and not source.warnings:
+    if recovered is None and not source.warnings:
         report.notes.append("the log was whole: nothing had to be recovered")
-    if found is None and cut:
+    if recovered is None and cut:
         beside = stored_path(first).name
         report.notes.append(
             f"there is no {wal.name} beside {beside}, the write-ahead log that a killed "
@@ -291,10 +291,10 @@ def recover_log(
 
 def _missing(source: RawLog, log: EditedLog) -> int | None:
     """Count the accepted messages that are not in the new file; None if unknown."""
-    found = source.file.recovered
-    if found is None or found.accepted is None:
+    recovered = source.file.recovered
+    if recovered is None or recovered.accepted is None:
         return None
-    return max(0, found.accepted - sum(log.counts.values()))
+    return max(0, recovered.accepted - sum(log.counts.values()))
 
 
 def _note(source: RawLog, log: EditedLog, report: RecoverReport) -> None:

@@ -73,18 +73,18 @@ def copy_records(
     records, health = _merged_metadata(sources, robot, warnings)
     for name, entries in records:
         log.note(name, entries)
-    known: dict[str, list[bytes]] = {}
+    copies: dict[str, list[bytes]] = {}
     for source in ordered:
         for attachment in source.attachments:
-            if attachment.data in known.get(attachment.name, []):
+            if attachment.data in copies.get(attachment.name, []):
                 continue
-            name = free_name(attachment.name, known, "{stem}-{n}{suffix}")
+            name = free_name(attachment.name, copies, "{stem}-{n}{suffix}")
             if name != attachment.name:
                 warnings.append(
                     f"{attachment.name} of {source.path} differs from another one: kept as {name}"
                 )
-            known.setdefault(attachment.name, []).append(attachment.data)
-            known.setdefault(name, [attachment.data])
+            copies.setdefault(attachment.name, []).append(attachment.data)
+            copies.setdefault(name, [attachment.data])
             log.attach(attachment, name)
     return health
 
@@ -231,9 +231,9 @@ def merge_logs(
 
 
 def _refuse_twice(sources: Sequence[RawLog]) -> None:
-    for one, other in combinations(sources, 2):
-        if one.sha256 == other.sha256:
-            raise UsageError(f"{one.path} and {other.path} are the same log, byte for byte")
+    for first, other in combinations(sources, 2):
+        if first.sha256 == other.sha256:
+            raise UsageError(f"{first.path} and {other.path} are the same log, byte for byte")
 
 
 def _common_robot(sources: Sequence[RawLog], chosen: str | None) -> str:
@@ -256,7 +256,7 @@ def _common_robot(sources: Sequence[RawLog], chosen: str | None) -> str:
 def _refuse_other_types(sources: Sequence[RawLog]) -> None:
     """Refuse topics of one name with different types or units."""
     faults: list[str] = []
-    for (one, kinds), (other, others) in combinations(
+    for (first, kinds), (other, others) in combinations(
         [(source, _kinds(source)) for source in sources], 2
     ):
         for topic in sorted(kinds.keys() & others.keys()):
@@ -268,7 +268,7 @@ def _refuse_other_types(sources: Sequence[RawLog]) -> None:
                 a, b = (f"in {', '.join(sorted(kind.units))}" for kind in (this, that))
             else:
                 continue
-            faults.append(f"{topic} is {a} in {one.path} and {b} in {other.path}")
+            faults.append(f"{topic} is {a} in {first.path} and {b} in {other.path}")
     if faults:
         raise DataError(
             f"{'; '.join(faults)}. A topic has one type and one unit: leave it out of one log "
@@ -319,19 +319,19 @@ def _other_robots(sources: Sequence[RawLog], robot: str) -> Iterator[str]:
             fact = f"{source.path} is of {source.robot}, not of {robot}"
             yield f"{fact}: its messages are merged all the same"
     joints = [(source, _joint_names(source)) for source in sources]
-    for (one, names), (other, others) in combinations(joints, 2):
-        unstated = not one.robot or not other.robot
+    for (first, names), (other, others) in combinations(joints, 2):
+        unstated = not first.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
-            here, there = (some_names(sorted(each), 3) for each in (names, others))
+            here, there = (some_names(sorted(group), 3) for group in (names, others))
             yield (
-                f"{one.path} has {here}, {other.path} has {there}: no joint "
+                f"{first.path} has {here}, {other.path} has {there}: no joint "
                 "is in both, are they of one robot?"
             )
 
 
 def _joint_names(source: RawLog) -> set[str]:
     """Return the joints in the first message of each JointState topic."""
-    topics, found = Topics(source.file, source.warn), set[str]()
+    topics, names = Topics(source.file, source.warn), set[str]()
     pending = {
         topic
         for topic, channel in topics.channels.items()
@@ -340,17 +340,17 @@ def _joint_names(source: RawLog) -> set[str]:
     for topic, message in topics.raw_of(pending):
         pending.discard(topic)
         with suppress(DataError):  # of a damaged message
-            found.update(names_of(layout_of(topics.message_type(topic), message)))
-    return found
+            names.update(names_of(layout_of(topics.message_type(topic), message)))
+    return names
 
 
 def _apart(sources: Sequence[RawLog], *, allowed: bool) -> Iterator[str]:
     """Warn of logs with time between them, and refuse those that are far apart."""
     ordered = sorted(
-        (source for source in sources if source.end_ns), key=lambda each: each.start_ns
+        (source for source in sources if source.end_ns), key=lambda source: source.start_ns
     )
     for k, later in enumerate(ordered[1:], start=1):
-        earlier = max(ordered[:k], key=lambda each: each.end_ns)
+        earlier = max(ordered[:k], key=lambda source: source.end_ns)
         gap_s = (later.start_ns - earlier.end_ns) / NS
         sentence = f"{later.path} begins {_span(gap_s)} after {earlier.path} ends"
         if gap_s > LONGEST_MERGE_GAP_S and not allowed:
@@ -368,14 +368,14 @@ def _span(seconds: float) -> str:
 
 def _mixed(sources: Sequence[RawLog]) -> Iterator[str]:
     """Warn of logs that hold the same topics at the same times."""
-    for one, other in combinations(sources, 2):
-        start, stop = max(one.start_ns, other.start_ns), min(one.end_ns, other.end_ns)
-        topics = {c.topic for c in one.file.channels.values() if one.file.counts.get(c.id)} & {
+    for first, other in combinations(sources, 2):
+        start, stop = max(first.start_ns, other.start_ns), min(first.end_ns, other.end_ns)
+        topics = {c.topic for c in first.file.channels.values() if first.file.counts.get(c.id)} & {
             c.topic for c in other.file.channels.values() if other.file.counts.get(c.id)
         }
         if start <= stop and topics:
             yield (
-                f"{one.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
+                f"{first.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
                 f"{len(topics)} topics ({', '.join(sorted(topics)[:3])}"
                 f"{', ...' if len(topics) > 3 else ''}): their messages are mixed"
             )

@@ -110,27 +110,27 @@ def filled_arenas(
         A buffer, which is overwritten by the next iteration, and the blocks in it.
     """
     ids = set(channel_ids)
-    wanted = [
+    selected = [
         block
         for block in blocks
         if (not ids.isdisjoint(block.index_at) if block.index_at else not block.is_empty)
     ]
-    log_file.expect(wanted)
-    runs = list(_runs(log_file, wanted))
+    log_file.expect(selected)
+    runs = list(_runs(log_file, selected))
     spare = 1 if threads > 1 and len(runs) > 1 else 0
     keep_freed(ARENA_SIZE)  # no copy of messages is larger
     scratch = log_file.scratch
     arenas = [scratch.pop() if scratch else new_pages(ARENA_SIZE) for _ in range(1 + spare)]
-    with helpers(max(min(threads, len(wanted)), 1)) as pool:
+    with helpers(max(min(threads, len(selected)), 1)) as pool:
         for pieces in ahead(_begun(log_file, runs, arenas, pool), spare):
             if pool is not None:
                 for piece in reversed(pieces):  # the helpers begin at the other end
                     piece.hurry()
-            found = [piece.result() for piece in pieces]
-            for each in found:
-                if isinstance(each, LogError):
-                    warn(f"{each}; its messages are missing")
-            filled = [each for each in found if not isinstance(each, LogError)]
+            results = [piece.result() for piece in pieces]
+            for outcome in results:
+                if isinstance(outcome, LogError):
+                    warn(f"{outcome}; its messages are missing")
+            filled = [result for result in results if not isinstance(result, LogError)]
             if filled:
                 yield filled[0][0], [placed for _, placed in filled]
     if len(blocks) < len(log_file.blocks):  # after a window there is often another
@@ -228,7 +228,7 @@ def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
 
 def record_batches(
     log_file: LogFile,
-    wanted: Sequence[Sequence[int]],
+    topic_ids: Sequence[Sequence[int]],
     blocks: Sequence[Block],
     warn: Callable[[str], None],
     threads: int = 1,
@@ -236,35 +236,35 @@ def record_batches(
     """Yield the message records of some topics, many blocks at a time.
 
     Args:
-        wanted: Channel ids, one sequence per topic.
+        topic_ids: Channel ids, one sequence per topic.
         warn: Called with one sentence for each unreadable block.
         threads: Number of decompressing threads.
 
     Yields:
         A buffer, which is overwritten by the next iteration, and the records of each topic.
     """
-    ids = list(itertools.chain.from_iterable(wanted))
-    for data, placed in filled_arenas(log_file, ids, _in_groups(blocks, wanted), warn, threads):
+    ids = list(itertools.chain.from_iterable(topic_ids))
+    for data, placed in filled_arenas(log_file, ids, _in_groups(blocks, topic_ids), warn, threads):
         try:
-            found = _records(log_file, data, placed, wanted)
+            records = _records(log_file, data, placed, topic_ids)
         except LogError:  # of one of the blocks: the others are read
-            for one in placed:
+            for single in placed:
                 try:
-                    alone = _records(log_file, data, [one], wanted)
+                    alone = _records(log_file, data, [single], topic_ids)
                 except LogError as error:
                     warn(f"{error}; its messages are missing")
                 else:
                     yield data, alone
         else:
-            yield data, found
+            yield data, records
 
 
-def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequence[Block]:
+def _in_groups(blocks: Sequence[Block], topic_ids: Sequence[Sequence[int]]) -> Sequence[Block]:
     """Order blocks by topic, if topics don't share blocks; those of a topic stay in file order.
 
     Their records are then many at a time and evenly spaced.
     """
-    topic_of = {channel_id: k for k, ids in enumerate(wanted) for channel_id in ids}
+    topic_of = {channel_id: k for k, ids in enumerate(topic_ids) for channel_id in ids}
     if not all(block.index_at for block in blocks):  # one without an index may have any of them
         return blocks
     had = [{topic_of[key] for key in block.index_at if key in topic_of} for block in blocks]
@@ -275,14 +275,14 @@ def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequ
 
 
 def _records(
-    log_file: LogFile, data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+    log_file: LogFile, data: Buffer, placed: Sequence[Placed], topic_ids: Sequence[Sequence[int]]
 ) -> list[Records]:
     """Return the checked records of each topic."""
-    tiled = _tiled(data, placed, wanted)
+    tiled = _tiled(data, placed, topic_ids)
     if tiled is not None:
         return tiled
-    found: list[Records] = []
-    for starts in _indexed(log_file, placed, wanted):
+    by_topic: list[Records] = []
+    for starts in _indexed(log_file, placed, topic_ids):
         at = starts.offsets
         records = (
             _alike(data, starts) if len(at) else Records(at, at, None, MessageOffsets(data, at))
@@ -294,17 +294,17 @@ def _records(
                 )
             log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
             records = Records(at, log_ns, None, MessageOffsets(data, at + BODY_AT))
-        found.append(records)
-    return found
+        by_topic.append(records)
+    return by_topic
 
 
 def _tiled(
-    data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+    data: Buffer, placed: Sequence[Placed], topic_ids: Sequence[Sequence[int]]
 ) -> list[Records] | None:
     """Find the records of a topic that shares no block, without the index; None if impossible."""
-    only = {key for one in placed for key in one.block.index_at}
+    only = {key for part in placed for key in part.block.index_at}
     base, stop = placed[0].base, placed[-1].stop
-    filled = sum(one.stop - one.base for one in placed)
+    filled = sum(part.stop - part.base for part in placed)
     if len(only) != 1 or filled != stop - base or filled < BODY_AT:
         return None
     start = bytes(data[base : base + _CHANNEL_START.size])
@@ -312,15 +312,15 @@ def _tiled(
     size = PREFIX_SIZE + length
     if opcode != Opcode.MESSAGE or length < FIXED_SIZE or channel_id not in only:
         return None
-    if any((one.stop - one.base) % size for one in placed):
+    if any((part.stop - part.base) % size for part in placed):
         return None
     places = MessageOffsets(data, np.arange(base, stop, size, dtype=np.int64), size)
     if places.field(_CHANNEL_START_KIND, 0).tobytes() != start * len(places):
         return None
     nothing = np.empty(0, dtype=np.int64)
     none = Records(nothing, nothing, None, MessageOffsets(data, nothing))
-    own = _records_at(places.at, places, length)
-    return [own if channel_id in channel_ids else none for channel_ids in wanted]
+    records = _records_at(places.at, places, length)
+    return [records if channel_id in channel_ids else none for channel_ids in topic_ids]
 
 
 def _records_at(offsets: IntArray, places: MessageOffsets, length: int) -> Records:
@@ -373,16 +373,16 @@ class _Starts:
 
 
 def _indexed(
-    log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+    log_file: LogFile, placed: Sequence[Placed], topic_ids: Sequence[Sequence[int]]
 ) -> list[_Starts]:
     """Find the records of each topic in the blocks' indexes."""
-    ids = list(itertools.chain.from_iterable(wanted))
-    indexes = [log_file.source_of(one.block).indexed(one.block, ids) for one in placed]
+    ids = list(itertools.chain.from_iterable(topic_ids))
+    indexes = [log_file.source_of(part.block).indexed(part.block, ids) for part in placed]
     pieces: list[IntArray] = []
     blocks: list[int] = []
     limits = [0]  # of the topics, in pieces
     at = 0
-    for channel_ids in wanted:
+    for channel_ids in topic_ids:
         for number, index in enumerate(indexes):
             for piece in index[at : at + len(channel_ids)]:
                 if len(piece):
@@ -392,8 +392,8 @@ def _indexed(
         limits.append(len(pieces))
     if not pieces:
         nothing = np.empty(0, dtype=np.int64)
-        return [_Starts(nothing, 0, nothing, nothing) for _ in wanted]
-    bounds = np.array([(one.base, one.stop) for one in placed], dtype=np.int64)[blocks]
+        return [_Starts(nothing, 0, nothing, nothing) for _ in topic_ids]
+    bounds = np.array([(part.base, part.stop) for part in placed], dtype=np.int64)[blocks]
     bases, ends = bounds[:, 0], bounds[:, 1]
     counts = np.array([len(piece) for piece in pieces], dtype=np.int64)
     offsets = np.concatenate(pieces)

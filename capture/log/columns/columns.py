@@ -62,13 +62,13 @@ class Request:
         Raises:
             DataError: If it has no layout.
         """
-        known = self.layouts.get(len(message))
-        if known is not None and known.fits(message):
-            return known
-        found = layout_of(self.message_type, message)
-        if known is not None or len(self.layouts) < MOST_LAYOUTS:
-            self.layouts[len(message)] = found
-        return found
+        cached = self.layouts.get(len(message))
+        if cached is not None and cached.fits(message):
+            return cached
+        layout = layout_of(self.message_type, message)
+        if cached is not None or len(self.layouts) < MOST_LAYOUTS:
+            self.layouts[len(message)] = layout
+        return layout
 
 
 @dataclass
@@ -121,10 +121,10 @@ def read_messages(
         )
         for request in requests
     ]
-    wanted = [request.channel_ids for request in requests]
-    batches = record_batches(log_file, wanted, blocks, warn, threads)
-    for k, (_, found) in enumerate(batches, start=1):
-        for reader, records in zip(readers, found, strict=True):
+    topic_ids = [request.channel_ids for request in requests]
+    batches = record_batches(log_file, topic_ids, blocks, warn, threads)
+    for k, (_, batch) in enumerate(batches, start=1):
+        for reader, records in zip(readers, batch, strict=True):
             if len(records.offsets):
                 reader.add(records, window_ns)
         if log_file.pages is not None and k % _HELD == 0:

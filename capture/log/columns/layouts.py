@@ -218,13 +218,13 @@ class Stamping:
             parts = (places.field(leaf.dtype, leaf.offset) for leaf in stamp)
             return Times.of(log_ns, time_ns(*parts))
         raw = np.ascontiguousarray(places.field("V8", seconds.offset)).view("<i8")
-        known = self._times
+        cached = self._times
         if (
-            known is not None
+            cached is not None
             and np.array_equal(raw, self._raw)
-            and np.array_equal(log_ns, known.log_ns)
+            and np.array_equal(log_ns, cached.log_ns)
         ):
-            return known
+            return cached
         parts = raw.view(TIME)
         self._raw = raw
         self._times = Times.of(log_ns, time_ns(parts["sec"], parts["nanosec"]))
@@ -320,9 +320,9 @@ class Group:
             count = _COMPARED // run.itemsize + 1
             if not self._tiles[k]:
                 self._tiles[k] = self.layout.example[start : start + run.itemsize] * count
-            found = places.field(run, start)
-            for first in range(0, len(found), count):
-                if not self._tiles[k].startswith(found[first : first + count].tobytes()):
+            fields = places.field(run, start)
+            for first in range(0, len(fields), count):
+                if not self._tiles[k].startswith(fields[first : first + count].tobytes()):
                     return False
         return True
 

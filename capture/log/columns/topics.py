@@ -100,12 +100,12 @@ class Topics:
         )
 
     def read(
-        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+        self, topics: Mapping[str, Sequence[str] | None], window_ns: Window
     ) -> dict[str, Messages]:
         """Read topics in one pass.
 
         Args:
-            wanted: Topic to leaf paths; None for all.
+            topics: Topic to leaf paths; None for all.
             window_ns: Half-open window of log times [Unix ns]; None for open ends.
 
         Raises:
@@ -121,7 +121,7 @@ class Topics:
                 paths,
                 self._layouts.setdefault(topic, {}),
             )
-            for topic, paths in wanted.items()
+            for topic, paths in topics.items()
         ]
         try:
             messages = read_messages(
@@ -129,7 +129,7 @@ class Topics:
             )
         except DataError as error:
             raise DataError(f"{self._file.path}: {error}") from None
-        return dict(zip(wanted, messages, strict=True))
+        return dict(zip(topics, messages, strict=True))
 
     @property
     def path(self) -> Path:
@@ -210,9 +210,9 @@ class Topics:
             names = [topic for topic in self._ids if topic in pending]
             if not names:
                 return
-            wanted = [self._ids[topic] for topic in names]
-            for data, found in record_batches(self._file, wanted, [block], self._warn):
-                for topic, records in zip(names, found, strict=True):
+            topic_ids = [self._ids[topic] for topic in names]
+            for data, batch in record_batches(self._file, topic_ids, [block], self._warn):
+                for topic, records in zip(names, batch, strict=True):
                     for at in records.offsets.tolist():
                         if topic not in pending:
                             break
@@ -270,10 +270,10 @@ class Topics:
             or schema.encoding != _SCHEMA_ENCODING
             or channel.message_encoding != _ENCODING
         ):
-            found = f"{channel.message_encoding or 'no encoding'} with " + (
+            actual = f"{channel.message_encoding or 'no encoding'} with " + (
                 f"a {schema.encoding or 'nameless'} schema" if schema is not None else "no schema"
             )
             raise DataError(
-                f"{self._file.path}: {topic} is {found}; only ROS 2 messages (cdr) are read"
+                f"{self._file.path}: {topic} is {actual}; only ROS 2 messages (cdr) are read"
             )
         return schema

@@ -106,9 +106,9 @@ def definition(connection: Connection, example: bytes | None) -> tuple[str, str]
     for text in forms:
         store = get_typestore(Stores.LATEST)
         if text:
-            more = {name: each for name, each in _DYNAMIC.items() if name != kind}
-            for name, each in {**more, kind: text}.items():
-                store.register(get_types_from_msg(each, name))
+            more = {name: entry for name, entry in _DYNAMIC.items() if name != kind}
+            for name, body in {**more, kind: text}.items():
+                store.register(get_types_from_msg(body, name))
         if kind in store.fielddefs and (kind != CONTROLLER_STATE or _fits(store, kind, example)):
             return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0]
     return "", ""  # kept raw
@@ -137,12 +137,14 @@ class Ros1Types:
         # The conversion leaves out the sequence number of a header, so that its type has none.
         header = "builtin_interfaces/Time stamp\nstring frame_id\n"
         self._store.register(get_types_from_msg(header, _HEADER))
-        known: dict[str, str] = {}
+        texts: dict[str, str] = {}
         for connection in connections:
-            known.setdefault(connection.msgtype, connection.msgdef.data)
-        for kind, text in known.items():
+            texts.setdefault(connection.msgtype, connection.msgdef.data)
+        for kind, text in texts.items():
             types = get_types_from_msg(text, kind)
-            self._store.register({name: each for name, each in types.items() if name != _HEADER})
+            self._store.register(
+                {name: fields for name, fields in types.items() if name != _HEADER}
+            )
 
     def definition(self, connection: Connection) -> tuple[str, str]:
         """Return the encoding and text of a type's definition in ROS 2."""
@@ -380,8 +382,10 @@ class _Copy:
     ) -> int:
         key = connection.topic, connection.msgtype
         if key not in self._channels:
-            found = described(connection) if described else definition(connection, example)
-            schema = self._writer.register_schema(connection.msgtype, found[0], found[1].encode())
+            description = described(connection) if described else definition(connection, example)
+            schema = self._writer.register_schema(
+                connection.msgtype, description[0], description[1].encode()
+            )
             encoding = getattr(connection.ext, "serialization_format", "cdr")
             self._channels[key] = self._writer.register_channel(connection.topic, encoding, schema)
         return self._channels[key]

@@ -174,8 +174,8 @@ def _mcap(path: Path) -> Generator[BagPart]:
                     walked = walk_records(data, start, stop)
                     places = ((a, b) for kind, a, b in walked if kind == Opcode.MESSAGE)
                 else:  # messages outside of chunks lie between other records
-                    found = (block.offsets or {}).values()
-                    offsets = sorted(start + at for each in found for at in each.tolist())
+                    by_channel = (block.offsets or {}).values()
+                    offsets = sorted(start + at for array in by_channel for at in array.tolist())
                     places = ((at + PREFIX_SIZE, _end(data, at)) for at in offsets)
                 for body, end in places:
                     if end - body >= _FIXED.size:

@@ -84,9 +84,9 @@ class BoundedReader(Reader):
         return super().read_chunk()._replace(decompressor=partial(self._taken, expand))
 
     def _taken(self, expand: Callable[[bytes], bytes], data: bytes) -> bytes:
-        found = expand(data)
-        self._allowance.take(len(found))
-        return found
+        expanded = expand(data)
+        self._allowance.take(len(expanded))
+        return expanded
 
 
 class SummaryReader(BoundedReader):
@@ -104,10 +104,10 @@ def _bz2(size: int, data: bytes) -> bytes:
     if size > largest_chunk():
         raise ReaderError(f"A chunk declares {size} bytes, more than {largest_chunk() >> 20} MiB.")
     decompressor = bz2.BZ2Decompressor()
-    found = decompressor.decompress(data, max_length=size + 1)
-    if len(found) != size:
-        raise ReaderError(f"A chunk of {size} bytes expands to {len(found)} or more.")
-    return found
+    expanded = decompressor.decompress(data, max_length=size + 1)
+    if len(expanded) != size:
+        raise ReaderError(f"A chunk of {size} bytes expands to {len(expanded)} or more.")
+    return expanded
 
 
 def _lz4(size: int, data: bytes) -> bytes:

@@ -51,9 +51,9 @@ def content_id_of(paths: Sequence[Path]) -> str:
         files: list[tuple[int, Read]] = []
         for path in paths:
             check_regular(path)
-            own = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-            stack.callback(os.close, own)
-            files.append((os.fstat(own).st_size, partial(_read, own)))
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            stack.callback(os.close, descriptor)
+            files.append((os.fstat(descriptor).st_size, partial(_read, descriptor)))
         return content_id(files)
 
 

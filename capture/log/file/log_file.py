@@ -98,18 +98,18 @@ class FilePages:
             with TemporaryFile(dir=self._folder) as file:
                 # A hole in a mapped file ends the process when the disk is full: reserve it all.
                 os.posix_fallocate(file.fileno(), 0, size)
-                found = mmap.mmap(file.fileno(), size)
+                pages = mmap.mmap(file.fileno(), size)
         except OSError:
             return new_pages(size)
-        self._held.add(found)
+        self._held.add(pages)
         self._used = True
-        return found
+        return pages
 
     def release(self) -> None:
         """Release the pages, which are read again when needed, and freed memory."""
         held = list(self._held)
-        for each in held:
-            each.madvise(mmap.MADV_DONTNEED)
+        for pages in held:
+            pages.madvise(mmap.MADV_DONTNEED)
         if self._used and _TRIM is not None:
             _TRIM(0)
         self._used = bool(held)  # once more after the last one: it takes milliseconds
@@ -249,7 +249,7 @@ class LogFile(Contents):
         filled = [block for block in self.blocks if block.end_ns]
         if not filled:
             return 0, 0
-        first, last = min(each.start_ns for each in filled), max(each.end_ns for each in filled)
+        first, last = min(block.start_ns for block in filled), max(block.end_ns for block in filled)
         return min(first, LAST_NS), min(last, LAST_NS)
 
     def close(self) -> None:
@@ -275,8 +275,8 @@ class LogFile(Contents):
     @cached_property
     def session_id(self) -> str:
         """The session's id; one from the content if it has none, or else the file's name."""
-        if own := self.metadata.get("undulog", {}).get("session_id"):
-            return own
+        if stated := self.metadata.get("undulog", {}).get("session_id"):
+            return stated
         if self._bag is not None:
             return self._bag.content
         if not self.files:
@@ -352,8 +352,8 @@ class LogFile(Contents):
         """Warn of a write-ahead log of another session, left by a copy."""
         facts = [i for i in wal.definitions if isinstance(i, Metadata) and i.name == "undulog"]
         ids = {item.metadata["session_id"] for item in facts if "session_id" in item.metadata}
-        own = self.metadata.get("undulog", {}).get("session_id")
-        if own is None or not ids or own in ids:
+        session_id = self.metadata.get("undulog", {}).get("session_id")
+        if session_id is None or not ids or session_id in ids:
             return
         part = wal.folder.with_suffix(SUFFIX)
         and_part = f", and {part.name} to NAME.mcap{SUFFIX}" if part.exists() else ""
@@ -384,12 +384,12 @@ class LogFile(Contents):
         self.recovered = Recovered(
             wal.folder, wal.live, in_files, len(rest), accepted, looked, self._unfinished
         )
-        found = list(wal.warnings)
+        warnings = list(wal.warnings)
         if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
-            found = [text for text in found if "no readable header" not in text]
-        self.warnings += [self.recovered.warning, *found]
+            warnings = [text for text in warnings if "no readable header" not in text]
+        self.warnings += [self.recovered.warning, *warnings]
 
     def _define(self, wal: WalContents) -> None:
         """Add definitions of a write-ahead log that the files don't have."""

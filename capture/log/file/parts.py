@@ -292,8 +292,8 @@ def _gaps(files: PartFiles, first: Path, there: set[int], *, bare: bool) -> list
 
 
 def _redefines(file: McapFile, others: list[McapFile]) -> bool:
-    known = {key: kind for other in others for key, kind in _kinds(other)}
-    return any(known.get(key, kind) != kind for key, kind in _kinds(file))
+    kinds = {key: kind for other in others for key, kind in _kinds(other)}
+    return any(kinds.get(key, kind) != kind for key, kind in _kinds(file))
 
 
 def _kinds(file: McapFile) -> list[tuple[int, tuple[str, str, bytes]]]:
@@ -314,13 +314,13 @@ def _session_id(file: McapFile) -> str:
 
 def _is_part(path: Path, head: Path) -> bool:
     """Whether a file with the name of a later part is one: by its record, or if it is empty."""
-    known = stored_path(head).exists() or wal_folder(head).is_dir()
+    recorded = stored_path(head).exists() or wal_folder(head).is_dir()
     try:
         file = _open(path, bare=True)
     except LogError:
-        return known or not stored_path(path).exists()
+        return recorded or not stored_path(path).exists()
     try:
-        return PART_RECORD in file.metadata or (known and not file.channels)
+        return PART_RECORD in file.metadata or (recorded and not file.channels)
     finally:
         file.close()
 

@@ -83,9 +83,11 @@ def named_identifiers(robot: Robot) -> frozenset[int]:
     if robot.bus is None:
         return frozenset()
     messages = database_messages(dict(robot.databases), Faults()) or {}
-    found = (messages.get(signal.message) for signal in robot.bus.signals)
+    matches = (messages.get(signal.message) for signal in robot.bus.signals)
     return frozenset(
-        each.frame_id | (EXTENDED_FLAG if each.is_extended_frame else 0) for each in found if each
+        message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
+        for message in matches
+        if message
     )
 
 
@@ -109,8 +111,10 @@ class IdentifierTally:
         id_flags = frames["id_flags"]
         data = id_flags[(id_flags & np.uint32(ERROR_FLAG | REMOTE_FLAG)) == 0]
         self.frames += len(data)
-        found, counts = np.unique(data & np.uint32(EXTENDED_FLAG | ID_MASK), return_counts=True)
-        for identifier, count in zip(found.tolist(), counts.tolist(), strict=True):
+        identifiers, counts = np.unique(
+            data & np.uint32(EXTENDED_FLAG | ID_MASK), return_counts=True
+        )
+        for identifier, count in zip(identifiers.tolist(), counts.tolist(), strict=True):
             if identifier in self.counts or len(self.counts) < self.MOST:
                 self.counts[identifier] += count
 
@@ -257,8 +261,8 @@ def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, 
         DataError: If the message can't be decoded.
     """
     layout = layout_of(kind, message)
-    text, found = layout.strings, list[DiagnosticStatus]()
-    while (at := f"status[{len(found)}]") + ".name" in text:
+    text, statuses = layout.strings, list[DiagnosticStatus]()
+    while (at := f"status[{len(statuses)}]") + ".name" in text:
         values: dict[str, str] = {}
         k = 0
         while (item := f"{at}.values[{k}]") + ".key" in text:
@@ -268,8 +272,8 @@ def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, 
         name, content, device = (
             text[f"{at}.{part}"] for part in ("name", "message", "hardware_id")
         )
-        found.append(DiagnosticStatus(level, name, content, device, values))
-    return tuple(found)
+        statuses.append(DiagnosticStatus(level, name, content, device, values))
+    return tuple(statuses)
 
 
 def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[SourceHealth, ...]:

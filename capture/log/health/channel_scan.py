@@ -242,8 +242,8 @@ class ChannelScan:
     ) -> None:
         places: dict[tuple[str, ...], list[IntArray]] = {}
         for rows, matrix in whole:
-            for layout, own, part in self._by_layout(matrix):
-                names, chosen = names_of(layout), rows[own]
+            for layout, selection, part in self._by_layout(matrix):
+                names, chosen = names_of(layout), rows[selection]
                 places.setdefault(names, []).append(chosen)
                 series = self._series_of(names)
                 _count_nan(series, layout, part)
@@ -284,7 +284,7 @@ class ChannelScan:
             else (wire.FRAME_DTYPE, wire.FRAME_LAYOUT)
         )
         sizes = np.zeros(count, np.int64)
-        found: list[tuple[IntArray, Matrix]] = []
+        framed: list[tuple[IntArray, Matrix]] = []
         for rows, matrix in whole:
             try:
                 at, number = _records_in(kind, matrix[0].tobytes(), dtype, label)
@@ -292,11 +292,11 @@ class ChannelScan:
                 self.unread += len(rows)
                 continue
             if number:
-                found.append((rows, matrix[:, at : at + number * dtype.itemsize]))
+                framed.append((rows, matrix[:, at : at + number * dtype.itemsize]))
                 sizes[rows] = number
         starts = np.cumsum(sizes) - sizes
         frames = np.zeros(int(sizes.sum()), dtype)
-        for rows, data in found:
+        for rows, data in framed:
             records = np.ascontiguousarray(data).view(dtype)
             frames[starts[rows][:, None] + np.arange(records.shape[1])] = records
         bus.add(frames)
@@ -324,9 +324,9 @@ def _records_in(
     kind: MessageType, message: bytes, dtype: np.dtype[np.void], label: str
 ) -> tuple[int, int]:
     """Return offset and number of the frames in a message."""
-    found = records_at(message, label, dtype)
-    if found is not None:
-        return found
+    place = records_at(message, label, dtype)
+    if place is not None:
+        return place
     layout = layout_of(kind, message)
     leaf = layout.leaves.get("data")
     if leaf is None:

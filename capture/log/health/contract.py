@@ -133,8 +133,8 @@ def check_contract(path: Path | str) -> tuple[Violation, ...]:
     log = OpenLog(as_path(path), None, threads_or_default(None))
     try:
         order = list(RULES)
-        found = chain(_container(log), _topics(log), _record(log), _health(log), _robot(log))
-        return tuple(sorted(found, key=lambda one: order.index(one.rule)))
+        violations = chain(_container(log), _topics(log), _record(log), _health(log), _robot(log))
+        return tuple(sorted(violations, key=lambda violation: order.index(violation.rule)))
     finally:
         log.file.close()
 
@@ -152,12 +152,12 @@ def _container(log: OpenLog) -> Iterator[Violation]:
         chunks = [block for block in file.blocks if block.record_at and not block.is_empty]
         other = sorted({chunk.compression or "none" for chunk in chunks} - {"zstd"})
         if other or len(chunks) < len([block for block in file.blocks if not block.is_empty]):
-            found = ", ".join(other) or "messages outside of chunks"
-            yield Violation("compression", f"{name}: chunks", found, "compress them with zstd")
+            actual = ", ".join(other) or "messages outside of chunks"
+            yield Violation("compression", f"{name}: chunks", actual, "compress them with zstd")
         bare = sum(not chunk.crc for chunk in chunks)
         if bare:
-            found = f"{bare} of {len(chunks)} without a CRC"
-            yield Violation("crc", f"{name}: chunks", found, "write uncompressed_crc")
+            actual = f"{bare} of {len(chunks)} without a CRC"
+            yield Violation("crc", f"{name}: chunks", actual, "write uncompressed_crc")
         yield from _shared_chunks(file, name)
         yield from _record_first(file, name)
 
@@ -178,8 +178,8 @@ def _shared_chunks(file: McapFile, name: str) -> Iterator[Violation]:
             if len(held) > 1:
                 mixed.setdefault(topic, set()).update(held - {topic})
     for topic, others in sorted(mixed.items()):
-        found = f"chunks with {_listed(sorted(others))} in them"
-        yield Violation("chunks", f"{name}: {topic}", found, "give the topic chunks of its own")
+        actual = f"chunks with {_listed(sorted(others))} in them"
+        yield Violation("chunks", f"{name}: {topic}", actual, "give the topic chunks of its own")
 
 
 def _is_joint(file: McapFile, key: int) -> bool:
@@ -207,29 +207,29 @@ def _topics(log: OpenLog) -> Iterator[Violation]:
     view = SessionView(log)
     for topic, channel in sorted(view.channels.items()):
         if not channel.is_ros2:
-            found = f"{channel.encoding or 'nothing'} and {channel.schema_encoding or 'no schema'}"
-            yield Violation("encoding", f"{topic}: channel", found, "write cdr with ros2msg")
+            actual = f"{channel.encoding or 'nothing'} and {channel.schema_encoding or 'no schema'}"
+            yield Violation("encoding", f"{topic}: channel", actual, "write cdr with ros2msg")
             continue
         try:
             yield from _topic(view, topic, channel)
         except DataError as error:
-            found = str(error).removeprefix(f"{log.path}: ")
-            yield Violation("encoding", f"{topic}: messages", found, "write CDR of the schema")
+            actual = str(error).removeprefix(f"{log.path}: ")
+            yield Violation("encoding", f"{topic}: messages", actual, "write CDR of the schema")
 
 
 def _topic(view: SessionView, topic: str, channel: Channel) -> Iterator[Violation]:
-    wanted = _type_of(topic)
-    if wanted is not None and channel.type_name != wanted:
-        fix = f"write {wanted}, or name the topic otherwise"
+    expected = _type_of(topic)
+    if expected is not None and channel.type_name != expected:
+        fix = f"write {expected}, or name the topic otherwise"
         yield Violation("type", f"{topic}: schema", channel.type_name, fix)
         return
-    if wanted is not None and not is_of_contract(view.message_type(topic)):
+    if expected is not None and not is_of_contract(view.message_type(topic)):
         fix = "take the definition of ROS 2"
-        yield Violation("type", f"{topic}: schema", f"{wanted} with other fields", fix)
+        yield Violation("type", f"{topic}: schema", f"{expected} with other fields", fix)
         return
     if topic in _UNITS and channel.metadata.get("unit") != _UNITS[topic]:
-        found = repr(channel.metadata["unit"]) if "unit" in channel.metadata else "nothing"
-        yield Violation("unit", f"{topic}: channel metadata unit", found, f"{_UNITS[topic]!r}")
+        actual = repr(channel.metadata["unit"]) if "unit" in channel.metadata else "nothing"
+        yield Violation("unit", f"{topic}: channel metadata unit", actual, f"{_UNITS[topic]!r}")
     for log_ns, message in islice(view.messages(topic), 1):
         yield from _stamp(topic, log_ns, message)
         if channel.type_name == JOINT_STATE:
@@ -256,8 +256,8 @@ def _stamp(topic: str, log_ns: int, message: Any) -> Iterator[Violation]:
     stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
     where = f"{topic}: header.stamp of the first message"
     if stamp_ns == 0 or abs(stamp_ns - log_ns) > _DAY_NS:
-        found = "0" if stamp_ns == 0 else f"{(stamp_ns - log_ns) / 1e9:+.0f} s off the log time"
-        yield Violation("stamp", where, found, "write the sampling time in Unix ns")
+        actual = "0" if stamp_ns == 0 else f"{(stamp_ns - log_ns) / 1e9:+.0f} s off the log time"
+        yield Violation("stamp", where, actual, "write the sampling time in Unix ns")
 
 
 def _lengths(topic: str, message: Any) -> Iterator[Violation]:
@@ -282,12 +282,12 @@ def _names(view: SessionView, topic: str) -> Iterator[Violation]:
     robot = view.robot
     if robot is None or not orders:
         return
-    own = robot.joint_names
-    foreign = [name for name in orders[0] if name not in own]
+    joints = robot.joint_names
+    foreign = [name for name in orders[0] if name not in joints]
     if foreign:
-        fix = f"take the names of robot.toml: {_listed(own)}"
+        fix = f"take the names of robot.toml: {_listed(joints)}"
         yield Violation("names", f"{topic}: name", _listed(foreign), fix)
-    elif list(orders[0]) != [name for name in own if name in set(orders[0])]:
+    elif list(orders[0]) != [name for name in joints if name in set(orders[0])]:
         fix = "write joints in the order of robot.toml, from the head"
         yield Violation("names", f"{topic}: name", f"the order {_listed(orders[0])}", fix)
 
@@ -298,12 +298,12 @@ def _frames(topic: str, message: Any) -> Iterator[Violation]:
         (wire.FD_FRAME_LAYOUT, wire.FD_FRAME_DTYPE) if fd else (wire.FRAME_LAYOUT, wire.FRAME_DTYPE)
     )
     size = dtype.itemsize
-    dims = [(one.label, one.size) for one in message.layout.dim]
+    dims = [(dim.label, dim.size) for dim in message.layout.dim]
     count = len(message.data) // size
     if dims != [("frame", count), (layout, size)] or len(message.data) != count * size:
-        found = f"{dims} and {len(message.data)} bytes"
+        actual = f"{dims} and {len(message.data)} bytes"
         fix = f"label dim[0] 'frame' with their number, dim[1] '{layout}' with {size}"
-        yield Violation("frames", f"{topic}: layout of the first message", found, fix)
+        yield Violation("frames", f"{topic}: layout of the first message", actual, fix)
 
 
 # -- records and attachments -------------------------------------------------------------------
@@ -320,8 +320,8 @@ def _record(log: OpenLog) -> Iterator[Violation]:
             yield Violation("record", f"record undulog: {key}", "nothing", "write the key")
     version = str(CONTRACT_VERSION)
     if record.get("contract", version) != version:
-        found, fix = repr(record["contract"]), f"follow version {version}, and write it"
-        yield Violation("record", "record undulog: contract", found, fix)
+        actual, fix = repr(record["contract"]), f"follow version {version}, and write it"
+        yield Violation("record", "record undulog: contract", actual, fix)
     if not re.fullmatch(r"\d{1,19}", record.get("epoch_ns", "0")):
         fix = "write the Unix time of the start, whole ns"
         yield Violation("record", "record undulog: epoch_ns", repr(record["epoch_ns"]), fix)
@@ -336,8 +336,8 @@ def _health(log: OpenLog) -> Iterator[Violation]:
     if record is None:
         return
     if record.get("verdict") not in VERDICTS:
-        found, fix = repr(record.get("verdict")), f"write one of {', '.join(VERDICTS)}"
-        yield Violation("health", "record undulog.health: verdict", found, fix)
+        actual, fix = repr(record.get("verdict")), f"write one of {', '.join(VERDICTS)}"
+        yield Violation("health", "record undulog.health: verdict", actual, fix)
     try:
         is_list = isinstance(json.loads(record.get("reasons", "[]")), list)
     except (ValueError, RecursionError):
@@ -355,11 +355,11 @@ def _robot(log: OpenLog) -> Iterator[Violation]:
         yield Violation("robot", "attachment robot.toml", f"nothing, for {named!r}", fix)
     before = len(log.warnings)
     if attached and log.checked_robot is None:
-        found = "; ".join(log.warnings[before:]) or "a description with faults"
-        yield Violation("robot", "attachment robot.toml", found, "correct it: undulog robot check")
+        actual = "; ".join(log.warnings[before:]) or "a description with faults"
+        yield Violation("robot", "attachment robot.toml", actual, "correct it: undulog robot check")
     elif log.robot is not None and named and log.robot.name != named:
-        found, fix = repr(named), f"write the attached robot's name, {log.robot.name!r}"
-        yield Violation("robot", "record undulog: robot", found, fix)
+        actual, fix = repr(named), f"write the attached robot's name, {log.robot.name!r}"
+        yield Violation("robot", "record undulog: robot", actual, fix)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -68,8 +68,8 @@ def joined(faults: Iterable[ChannelFault]) -> list[Finding]:
     by_text: dict[tuple[int, str], list[ChannelFault]] = {}
     for fault in faults:
         if fault.gaps:
-            found = (group for group in groups if _one_loss(group[0], fault))
-            group = next(found, list[ChannelFault]())
+            matches = (group for group in groups if _one_loss(group[0], fault))
+            group = next(matches, list[ChannelFault]())
         else:
             group = by_text.setdefault((fault.weight, fault.text), [])
         if not group:
@@ -95,8 +95,8 @@ def _finding(group: Sequence[ChannelFault]) -> Finding:
     where = _where(group)
     if len(group) == 1:
         return Finding(worst.weight, f"{where}: {worst.text}")
-    each = f"{'late' if worst.late else 'lost'} together: at most" if worst.gaps else "each:"
-    return Finding(worst.weight, f"{where}, {each} {worst.text}")
+    extent = f"{'late' if worst.late else 'lost'} together: at most" if worst.gaps else "each:"
+    return Finding(worst.weight, f"{where}, {extent} {worst.text}")
 
 
 def _where(group: Sequence[ChannelFault]) -> str:
@@ -108,8 +108,8 @@ def _where(group: Sequence[ChannelFault]) -> str:
     for topic, name in names.items():
         topics.setdefault(tuple(name), []).append(topic)
     return "; ".join(
-        listed(where) + ("" if found == ("",) else f", {listed(found)}")
-        for found, where in topics.items()
+        listed(where) + ("" if joints == ("",) else f", {listed(joints)}")
+        for joints, where in topics.items()
     )
 
 

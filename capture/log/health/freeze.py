@@ -146,11 +146,11 @@ class FreezeTally:
             Longest run of frozen seconds [s] and its first second [Unix s], each of shape (m,);
             0 for a joint that never froze.
         """
-        found = np.intersect1d(
+        matched = np.intersect1d(
             measured.second, command.second, assume_unique=True, return_indices=True
         )
         # numpy's types don't say that there are three
-        seconds, here, there = cast("tuple[IntArray, IntArray, IntArray]", found)
+        seconds, here, there = cast("tuple[IntArray, IntArray, IntArray]", matched)
         stood = measured.high[here][:, self._measured]
         stood = stood == measured.low[here][:, self._measured]
         stood &= (measured.samples[here] >= FROZEN_SAMPLES)[:, None]

@@ -152,8 +152,8 @@ def judge_series(
         text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
         yield ChannelFault(1 + mostly_paused, label, "", f"{text}{timing.longest_s:.3g} s, {when}")
     if timing.regular:
-        found = _edges_and_jitter(health, start_ns, end_ns, commands_ns)
-        yield from (ChannelFault(weight, label, "", text) for weight, text in found)
+        faults = _edges_and_jitter(health, start_ns, end_ns, commands_ns)
+        yield from (ChannelFault(weight, label, "", text) for weight, text in faults)
     elif joints and timing.count > FROZEN_SAMPLES:
         yield ChannelFault(0, label, "", "no steady rate, so single gaps can't be found")
     if timing.backward:
@@ -302,8 +302,8 @@ def judge_following(fault: JointFault) -> Finding:
 
 def judge_differences(judgement: Judgement) -> Iterator[Finding]:
     """Yield findings on names, and on joints that changed, or that move besides their command."""
-    found = [clause_of(change, change.joint) for change in (*judgement.changes, *judgement.extra)]
-    yield from (Finding(1, clause) for clause in (judgement.naming, *found) if clause)
+    clauses = [clause_of(change, change.joint) for change in (*judgement.changes, *judgement.extra)]
+    yield from (Finding(1, clause) for clause in (judgement.naming, *clauses) if clause)
 
 
 def judge_bus(health: BusHealth) -> Iterator[Finding]:

@@ -194,9 +194,9 @@ class _Check:
         self._file = log.file
         self._view = SessionView(log)
         if topics != CONTRACT_TOPICS:
-            found = self._view.joint_topics(*topics)
+            chosen = self._view.joint_topics(*topics)
             self._view = self._view.with_joints(*topics)
-            topics = _recorded(log, found.command), _recorded(log, found.response)
+            topics = _recorded(log, chosen.command), _recorded(log, chosen.response)
         self._scan = SessionScan(log.checked_robot, topics=topics)
         self._notes = log.warnings[len(log.file.warnings) :]
         for key in log.file.channels:
@@ -206,16 +206,16 @@ class _Check:
         file = self._against_summary(self._read(on_part))
         facts = self._file.metadata.get("undulog", {})
         notes = [*judge_file(file), *judge_made_times(facts)]
-        found = self._scan.result(*self._file.limits, notes)
+        measures = self._scan.result(*self._file.limits, notes)
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
-            **{each.name: getattr(found, each.name) for each in fields(found)},
+            **{part.name: getattr(measures, part.name) for part in fields(measures)},
             path=self._file.path,
             session_id=self._file.session_id,
             stored=stored.get("verdict"),
             stored_reasons=stated_reasons(stored),
             file=file,
-            following=tuple(self._judge_following(file, found.reasons)),
+            following=tuple(self._judge_following(file, measures.reasons)),
         )
 
     def _judge_following(self, file: FileHealth, reasons: Sequence[str]) -> list[Finding]:
@@ -250,11 +250,11 @@ class _Check:
             on_part(done / total)
 
         files = log_file.files
-        found = [self._read_file(part, file, step) for part, file in enumerate(files)]
+        healths = [self._read_file(part, file, step) for part, file in enumerate(files)]
         prefixes = [f"{file.path.name}: " if len(files) > 1 else "" for file in files]
-        of_files = list(zip(prefixes, found, strict=True))
+        of_files = list(zip(prefixes, healths, strict=True))
         for block in log_file.blocks:
-            if block.part >= len(found):  # from the write-ahead log, checked when it was read
+            if block.part >= len(healths):  # from the write-ahead log, checked when it was read
                 self._read_block(block, log_file.path)
                 step()
         recovered = log_file.recovered
@@ -265,14 +265,17 @@ class _Check:
                 "are missing"
             )
         return FileHealth(
-            chunks=sum(one.chunks for one in found),
-            checked=sum(one.checked for one in found),
-            without_crc=sum(one.without_crc for one in found),
-            damage=(*(name + text for name, one in of_files for text in one.damage), *missing),
-            truncated=any(one.truncated for one in found),
-            indexed=all(one.indexed for one in found),
+            chunks=sum(health.chunks for health in healths),
+            checked=sum(health.checked for health in healths),
+            without_crc=sum(health.without_crc for health in healths),
+            damage=(
+                *(name + text for name, health in of_files for text in health.damage),
+                *missing,
+            ),
+            truncated=any(health.truncated for health in healths),
+            indexed=all(health.indexed for health in healths),
             notes=(
-                *(name + text for name, one in of_files for text in one.notes),
+                *(name + text for name, health in of_files for text in health.notes),
                 *self._notes,
                 *filter(None, [log_file.foreign_wal]),
             ),
@@ -291,11 +294,11 @@ class _Check:
         notes = [note for note in file.warnings if note not in skipped and not self._file.recovered]
         damage = [*container.damage, *skipped]
         read = {block.start for block in blocks}
-        known = {note.split(" ", 5)[4] for note in skipped}  # after "the record at byte"
+        positions = {note.split(" ", 5)[4] for note in skipped}  # after "the record at byte"
         damage += [
             _unlisted(file, chunk)
             for chunk in container.chunks.values()
-            if chunk.start not in read and str(chunk.record_at) not in known
+            if chunk.start not in read and str(chunk.record_at) not in positions
         ]
         checked = without_crc = 0
         for block in blocks:
@@ -355,15 +358,15 @@ class _Check:
         keys = list(block.offsets if block.offsets is not None else block.index_at)
         if not keys:
             return
-        found = [np.sort(source.offsets(block, key)) + base for key in keys]
-        heads = read_message_heads(data, np.concatenate(found), stop)
-        owners = np.repeat(keys, [len(offsets) for offsets in found])
-        twice = any((np.diff(offsets) == 0).any() for offsets in found)
+        places = [np.sort(source.offsets(block, key)) + base for key in keys]
+        heads = read_message_heads(data, np.concatenate(places), stop)
+        owners = np.repeat(keys, [len(offsets) for offsets in places])
+        twice = any((np.diff(offsets) == 0).any() for offsets in places)
         if heads is None or twice or (heads["channel"] != owners).any():
             where = f"the message index of the chunk at byte {block.start}"
             raise LogError(path, f"{where} does not list its messages")
         begin = 0
-        for key, offsets in zip(keys, found, strict=True):
+        for key, offsets in zip(keys, places, strict=True):
             if len(offsets) and key in self._file.channels:
                 self._scan.add(key, data, offsets, heads[begin : begin + len(offsets)])
             begin += len(offsets)

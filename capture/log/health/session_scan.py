@@ -191,21 +191,21 @@ class SessionScan:
             measured: Existing measures of channels.
         """
         taken = measured or {}
-        found = [
+        scans = [
             (key, scan) for key, scan in self._scans.items() if key in taken or self.count(key)
         ]
-        found.sort(key=lambda item: item[1].topic)
-        every = [taken.get(key) or self.measure(key) for key, _ in found]
-        channels = tuple(each.channel for each in every)
-        series = tuple(series for each in every for series in each.series)
-        joints = self._joints(found)
-        bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
+        scans.sort(key=lambda item: item[1].topic)
+        every = [taken.get(key) or self.measure(key) for key, _ in scans]
+        channels = tuple(measures.channel for measures in every)
+        series = tuple(series for measures in every for series in measures.series)
+        joints = self._joints(scans)
+        bitrate = self._bitrate([scan for _, scan in scans if scan.bus is not None])
         buses = tuple(
-            scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
+            scan.bus.result(scan.topic, bitrate) for _, scan in scans if scan.bus is not None
         )
         sources = tuple(
             source
-            for _, scan in found
+            for _, scan in scans
             if scan.ends is not None and scan.kind is not None
             for source in measure_sources(scan.kind, *scan.ends)
         )
@@ -214,7 +214,7 @@ class SessionScan:
         chain = self._robot.joint_names if self._robot is not None else ()
         seen = [joint.name for joint in joints if joint.topic == self._states]
         unseen = set(chain).difference(joint.name for joint in joints if joint.nan < joint.samples)
-        why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
+        why = self._undecoded([scan for _, scan in scans], all_joints=not unseen)
         topics = judge_topics(types, self._angles, chain, seen, why, commanded=self.commanded)
         findings = [*before, *topics]
         faults = [fault for channel in channels for fault in judge_channel(channel)]
@@ -222,9 +222,9 @@ class SessionScan:
         framed = {bus.topic for bus in buses}
         first = [channel.first_log_ns for channel in series if channel.topic == self._commands]
         commands_ns = min(first, default=None)
-        for each in series:
-            if each.topic not in framed:
-                faults += judge_series(each, start_ns, end_ns, commands_ns)
+        for health in series:
+            if health.topic not in framed:
+                faults += judge_series(health, start_ns, end_ns, commands_ns)
         findings += joined([*faults, *judge_joints(joints, start_ns)])
         states = [joint for joint in joints if joint.topic == self._states]
         findings += judge_body(states, (end_ns - start_ns) / NS)

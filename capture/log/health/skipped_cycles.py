@@ -61,7 +61,7 @@ def _same_cycles(series: SeriesHealth, skipped: Timing, commands: str) -> bool:
     if series.topic == commands:
         return series.timing == skipped
     timing = series.timing
-    ends = [each.longest_at_ns + round(each.longest_s * NS) for each in (timing, skipped)]
+    ends = [rhythm.longest_at_ns + round(rhythm.longest_s * NS) for rhythm in (timing, skipped)]
     overlap = min(ends) - max(timing.longest_at_ns, skipped.longest_at_ns)
     shortest = min(timing.longest_s, skipped.longest_s) * NS
     return bool(series.names) and timing.gaps == skipped.gaps and 2 * overlap > shortest

@@ -255,10 +255,10 @@ class _Scan:
             except (McapError, struct.error, ValueError, LogError) as error:
                 warnings.append(f"nothing of the last, cut chunk could be read: {error}")
                 return
-            found = sum(len(at) for at in (block.offsets or {}).values())
+            count = sum(len(at) for at in (block.offsets or {}).values())
             data, _, _ = self._file.payload(block)
             warnings.append(
-                f"the last chunk is cut short: {found} messages of it could be read "
+                f"the last chunk is cut short: {count} messages of it could be read "
                 f"({len(data)} of {block.size} bytes)"
             )
         else:
@@ -337,10 +337,10 @@ class McapFile(Contents, McapPayloads):
 
     def _find_contents(self, *, bare: bool) -> None:
         if self.buffer[: len(MAGIC)] != MAGIC:
-            found = bytes(self.buffer[: len(MAGIC)]).hex(" ")
+            start = bytes(self.buffer[: len(MAGIC)]).hex(" ")
             raise NotALogError(
                 self.path,
-                f"not an MCAP file (it starts with {found}); "
+                f"not an MCAP file (it starts with {start}); "
                 "'undulog import' reads CAN logs and CSV files",
             )
         try:
@@ -400,15 +400,15 @@ class McapFile(Contents, McapPayloads):
         Raises:
             LogError: If a record is damaged; as for :meth:`take`.
         """
-        found: dict[int, list[int]] = {}
+        offsets: dict[int, list[int]] = {}
         data, base, end = self.payload(block)
         for opcode, start, stop in walk_records(data, base, end):
             if opcode == Opcode.MESSAGE:
                 (channel_id,) = struct.unpack_from("<H", data, start)
-                found.setdefault(channel_id, []).append(start - PREFIX_SIZE - base)
+                offsets.setdefault(channel_id, []).append(start - PREFIX_SIZE - base)
             else:
                 self.take(opcode, data, start, stop)
-        return _arrays(found)
+        return _arrays(offsets)
 
     def add_unindexed(self, block: Block, offsets: dict[int, IntArray]) -> None:
         """Add a block whose messages were found by reading it."""
@@ -432,11 +432,11 @@ class McapFile(Contents, McapPayloads):
         buffer, base = self.around(block)
         end = len(buffer)
         head_size = _INDEX_HEAD.size
-        found: list[IntArray] = []
+        offsets: list[IntArray] = []
         for channel_id in channel_ids:
             at = block.index_at.get(channel_id)
             if at is None:
-                found.append(_NO_OFFSETS)
+                offsets.append(_NO_OFFSETS)
                 continue
             at -= base
             if at + head_size > end:
@@ -447,8 +447,8 @@ class McapFile(Contents, McapPayloads):
             if found_id != channel_id or size + 6 != length or size % 16:
                 raise LogError(self.path, f"the message index at byte {at} is damaged")
             entries = np.frombuffer(buffer, "<i8", size // 8, at + head_size)
-            found.append(entries[1::2])  # log time and offset of each
-        return found
+            offsets.append(entries[1::2])  # log time and offset of each
+        return offsets
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
         """Return the offsets of a channel's message records in a block's payload, checked.

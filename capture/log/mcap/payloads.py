@@ -188,26 +188,26 @@ class FetchedFile:
 
     def _fetch(self, block: Block) -> bytes:
         """Fetch a block and those that are expected behind it; return the block's piece."""
-        place, found = self._place.get(block.record_at), b""
+        place, content = self._place.get(block.record_at), b""
         batch, size = [block], self._size(block)
         for other in () if place is None else self._expected[place + 1 :]:
             size += self._size(other)
             if size > _BATCH:
                 break
             batch.append(other)
-        wanted = [
-            (one.record_at, self._ends[one.record_at])
-            for one in batch
-            if one is block or cache.get((self._owner, one.record_at)) is None
+        extents = [
+            (part.record_at, self._ends[part.record_at])
+            for part in batch
+            if part is block or cache.get((self._owner, part.record_at)) is None
         ]
-        ranges = merged_ranges(sorted(wanted), _GAP)
+        ranges = merged_ranges(sorted(extents), _GAP)
         for (base, stop), data in zip(ranges, self._file.read_many(ranges), strict=True):
-            for start, end in wanted:
+            for start, end in extents:
                 if base <= start < stop:
                     piece = data[start - base : end - base]
                     cache.put((self._owner, start), piece)
-                    found = piece if start == block.record_at else found
-        return found
+                    content = piece if start == block.record_at else content
+        return content
 
     def _size(self, block: Block) -> int:
         return self._ends[block.record_at] - block.record_at

@@ -235,8 +235,8 @@ class _Parser:
             raise DataError(f"schema {self._name}: types nested more than {_DEEPEST} deep")
         if short not in self._done:
             if short not in self._bodies:
-                known = ", ".join(sorted(self._bodies))
-                raise DataError(f"schema {self._name}: no definition of {short}; it has {known}")
+                defined = ", ".join(sorted(self._bodies))
+                raise DataError(f"schema {self._name}: no definition of {short}; it has {defined}")
             lines = self._bodies[short].splitlines()
             parsed = (self._field(line, short, (*path, short)) for line in lines)
             fields = tuple(part for part in parsed if part is not None)
@@ -246,13 +246,13 @@ class _Parser:
     def _type(self, short: str, fields: tuple[Field, ...]) -> MessageType:
         package, _, type_name = short.partition("/")
         nested = [part.nested for part in fields if part.nested is not None]
-        size = len(fields) + sum(each.size for each in nested)
+        size = len(fields) + sum(kind.size for kind in nested)
         if size > _MOST_FIELDS:
             raise DataError(
                 f"schema {self._name}: {short} has {size} fields, more than {_MOST_FIELDS}"
             )
         floats = any(part.base in _FLOATS for part in fields) or any(
-            each.has_floats for each in nested
+            kind.has_floats for kind in nested
         )
         return MessageType(f"{package}/msg/{type_name}", fields, size, floats)
 
@@ -326,10 +326,12 @@ def stated_reasons(health: Mapping[str, str]) -> tuple[str, ...]:
     """Return the reasons of a record ``undulog.health``; what is no JSON list is one reason."""
     text = health.get("reasons", "[]")
     try:
-        found: object = json.loads(text)
+        reasons: object = json.loads(text)
     except (ValueError, RecursionError):
         return (text,)
-    return tuple(map(str, cast("list[object]", found) if isinstance(found, list) else [found]))
+    return tuple(
+        map(str, cast("list[object]", reasons) if isinstance(reasons, list) else [reasons])
+    )
 
 
 @dataclass(frozen=True)

@@ -194,8 +194,8 @@ def join_batches(
     """
     if not batches:
         return np.zeros(0, dtype=dtype)
-    log_ns = np.concatenate([each for each, _, _ in batches])
-    place = np.concatenate([each for _, each, _ in batches])
+    log_ns = np.concatenate([times for times, _, _ in batches])
+    place = np.concatenate([places for _, places, _ in batches])
     in_order = (log_ns[1:] > log_ns[:-1]) | (
         (log_ns[1:] == log_ns[:-1]) & (place[1:] >= place[:-1])
     )

@@ -127,9 +127,9 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
     metadata: dict[str, dict[str, str]] = {}
     _add_metadata(metadata, _records(head, len(MAGIC)))
     tail = ranges.get(max(0, size - _EDGE), size) or b""
-    found = _found(ranges, size, tail, metadata)
-    if found.session_id:
-        return found
+    facts = _found(ranges, size, tail, metadata)
+    if facts.session_id:
+        return facts
 
     def piece(start: int, stop: int) -> bytes:
         if stop <= len(head):
@@ -137,7 +137,7 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
         ahead = size - len(tail)
         return tail[start - ahead : stop - ahead] if start >= ahead else read(start, stop)
 
-    return replace(found, content=content_id([(size, piece)]))
+    return replace(facts, content=content_id([(size, piece)]))
 
 
 def _found(

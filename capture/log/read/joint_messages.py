@@ -194,18 +194,18 @@ def sampled(
 
 def _interface(group: Group, part: str, field: str) -> tuple[tuple[str, ...], FloatArray]:
     """Return the joints that have an interface, and its values."""
-    wanted = (part if field == "position" else None) if part else field
+    interface = (part if field == "position" else None) if part else field
     names: list[str] = []
     columns: list[FloatArray] = []
     listed = interfaces(group.layout)
     for j, name in enumerate(names_of(group.layout, _JOINTS)):
-        own = listed.get(j, ())
-        if wanted is None or wanted not in own:
+        present = listed.get(j, ())
+        if interface is None or interface not in present:
             continue
         values = group.values(f"interface_values[{j}].values")
-        if values.shape[1] == len(own):
+        if values.shape[1] == len(present):
             names.append(name)
-            columns.append(values[:, own.index(wanted)])
+            columns.append(values[:, present.index(interface)])
     if not columns:
         return (), np.empty((len(group), 0))
     return tuple(names), np.stack(columns, axis=1)
@@ -213,12 +213,12 @@ def _interface(group: Group, part: str, field: str) -> tuple[tuple[str, ...], Fl
 
 def interfaces(layout: Layout) -> dict[int, list[str]]:
     """Return the interfaces of a DynamicJointState by the place of their joint."""
-    found: dict[int, list[str]] = {}
+    by_joint: dict[int, list[str]] = {}
     for path, text in layout.strings.items():
         if path.startswith("interface_values["):
             place = path.removeprefix("interface_values[").partition("]")[0]
-            found.setdefault(int(place), []).append(text)
-    return found
+            by_joint.setdefault(int(place), []).append(text)
+    return by_joint
 
 
 def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tuple[str, ...]]:
@@ -227,21 +227,21 @@ def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tu
     if type_name == DYNAMIC_STATE:
         listed = interfaces(layout)
         every = enumerate(names_of(layout, _JOINTS))
-        own = [(name, listed.get(j, ())) for j, name in every]
-        wanted = {"position": source.part} if source.part else {field: field for field in UNITS}
-        found = {
-            field: tuple(name for name, there in own if interface in there)
-            for field, interface in wanted.items()
+        pairs = [(name, listed.get(j, ())) for j, name in every]
+        requested = {"position": source.part} if source.part else {field: field for field in UNITS}
+        filled = {
+            field: tuple(name for name, there in pairs if interface in there)
+            for field, interface in requested.items()
         }
     elif type_name in FLOAT_ARRAYS:
-        found = {"position": source.joints if "data" in leaves else ()}
+        filled = {"position": source.joints if "data" in leaves else ()}
     elif type_name == CONTROLLER_STATE:
         names = names_of(layout, _JOINTS)
         paths = {field: f"{source.part}.{_POINT_FIELDS[field]}" for field in UNITS}
-        found = {field: names for field, path in paths.items() if path in leaves}
+        filled = {field: names for field, path in paths.items() if path in leaves}
     else:
-        found = {field: names_of(layout) for field in UNITS if field in leaves}
-    return {field: names for field, names in found.items() if names}
+        filled = {field: names_of(layout) for field in UNITS if field in leaves}
+    return {field: names for field, names in filled.items() if names}
 
 
 @dataclass(frozen=True)
@@ -316,7 +316,7 @@ def read_trajectory(log_ns: int, message: bytes) -> JointTrajectory:
             rows[field].append(values)
     values = {
         field: np.array(row).reshape(count, len(names))
-        if all(len(one) == len(names) for one in row)
+        if all(len(point) == len(names) for point in row)
         else np.empty((count, 0))
         for field, row in rows.items()
     }
@@ -356,19 +356,19 @@ def points_in_force(
     parts: dict[tuple[str, ...], list[tuple[IntArray, FloatArray]]] = {}
     first: dict[tuple[str, ...], int] = {}
     replaced = 0
-    in_order = sorted(every, key=lambda each: each.log_ns)
-    for one in reversed(in_order):
-        values = one.values[field]
+    in_order = sorted(every, key=lambda message: message.log_ns)
+    for trajectory in reversed(in_order):
+        values = trajectory.values[field]
         if not values.shape[1] or not len(values):
             continue
-        start_ns = one.stamp_ns + shift_ns if one.stamp_ns else one.log_ns
-        t_ns = min(start_ns, _LATEST_NS) + one.after_ns
-        kept = t_ns < first.get(one.names, np.iinfo(np.int64).max)
+        start_ns = trajectory.stamp_ns + shift_ns if trajectory.stamp_ns else trajectory.log_ns
+        t_ns = min(start_ns, _LATEST_NS) + trajectory.after_ns
+        kept = t_ns < first.get(trajectory.names, np.iinfo(np.int64).max)
         replaced += int((~kept).sum())
         if kept.any():
-            parts.setdefault(one.names, []).append((t_ns[kept], values[kept]))
-        first[one.names] = min(int(t_ns[0]), first.get(one.names, int(t_ns[0])))
-    found = [
+            parts.setdefault(trajectory.names, []).append((t_ns[kept], values[kept]))
+        first[trajectory.names] = min(int(t_ns[0]), first.get(trajectory.names, int(t_ns[0])))
+    points = [
         (
             names,
             np.concatenate([t_ns for t_ns, _ in reversed(part)]),
@@ -376,7 +376,7 @@ def points_in_force(
         )
         for names, part in parts.items()
     ]
-    return found, replaced
+    return points, replaced
 
 
 @dataclass(frozen=True)

@@ -68,14 +68,14 @@ def widened(window_ns: Window, slack_ns: int) -> Window:
     return None if start is None else start - slack_ns, None if stop is None else stop + slack_ns
 
 
-def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
+def covers(by_topic: Mapping[str, Messages], window_ns: Window) -> bool:
     """Whether messages surely extend beyond a window at both ends and are in order.
 
     Args:
         window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
     """
     start, stop = window_ns
-    for messages in found.values():
+    for messages in by_topic.values():
         if len(messages.groups) != 1 or messages.unread:
             return False
         stamps = messages.groups[0].stamps()
@@ -109,12 +109,12 @@ class JointReader:
         self._trajectories: dict[str, list[JointTrajectory]] = {}
 
     def read(
-        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+        self, topics: Mapping[str, Sequence[str]], window_ns: Window
     ) -> dict[tuple[str, str], JointSignals]:
         """Read fields of JointState topics in one pass over the file.
 
         Args:
-            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+            topics: Topic to fields: ``position``, ``velocity``, ``effort``.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
 
         Returns:
@@ -124,21 +124,21 @@ class JointReader:
             MissingChannelError: If the session has no such topic, or it never carries the field.
             DataError: If a topic is not of JointStates, or there is no such field.
         """
-        requests = self.requests(wanted)
+        requests = self.requests(topics)
         messages: dict[str, Messages] | None = None
         if self._topics.is_ours and window_ns != (None, None):
             messages = self._topics.read(requests, widened(window_ns, NEAR_NS))
         if messages is None or not covers(messages, window_ns):
             messages = self._topics.read(requests, widened(window_ns, SLACK_NS))
-        return self.signals(wanted, messages, window_ns)
+        return self.signals(topics, messages, window_ns)
 
-    def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str] | None]:
+    def requests(self, topics: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str] | None]:
         """Return the topics and leaf paths to read for some fields, with the offset topics.
 
         Trajectories are not among them: the times of their points have no window of log times.
 
         Args:
-            wanted: Name of a topic, or of a part of one, to fields: ``position``, ``velocity``,
+            topics: Name of a topic, or of a part of one, to fields: ``position``, ``velocity``,
                 ``effort``.
 
         Returns:
@@ -148,17 +148,17 @@ class JointReader:
             MissingChannelError: If the session has no such topic.
             DataError: If a topic has no joints, or there is no such field.
         """
-        self._check(wanted)
-        offsets = {topic for topic in map(self._offset_topic, wanted) if topic is not None}
+        self._check(topics)
+        offsets = {topic for topic in map(self._offset_topic, topics) if topic is not None}
         self._check(dict.fromkeys(offsets, ()))
         paths: dict[str, dict[str, None] | None] = {}
-        for name in [*wanted, *sorted(offsets)]:
+        for name in [*topics, *sorted(offsets)]:
             source, kind = self._source(name)
             if kind == TRAJECTORY:
                 continue
-            fields = [*wanted.get(name, ()), *(["position"] if name in offsets else [])]
-            own, known = leaf_paths(source, kind, fields), paths.get(source.topic, {})
-            both = None if own is None or known is None else known | dict.fromkeys(own)
+            fields = [*topics.get(name, ()), *(["position"] if name in offsets else [])]
+            leaves, earlier = leaf_paths(source, kind, fields), paths.get(source.topic, {})
+            both = None if leaves is None or earlier is None else earlier | dict.fromkeys(leaves)
             paths[source.topic] = both
         return {topic: None if path is None else list(path) for topic, path in paths.items()}
 
@@ -171,25 +171,25 @@ class JointReader:
         """
         self._check({name: ()})
         source, kind = self._source(name)
-        found: dict[str, dict[str, None]] = {}
+        joints: dict[str, dict[str, None]] = {}
         if kind == TRAJECTORY:
             for read_trajectory in self._read_trajectories(source.topic):
                 for field, values in read_trajectory.values.items():
                     if values.size:
-                        found.setdefault(field, {}).update(dict.fromkeys(read_trajectory.names))
+                        joints.setdefault(field, {}).update(dict.fromkeys(read_trajectory.names))
         else:
             for group in self._topics.read({source.topic: []}, (None, None))[source.topic].groups:
                 for field, names in carried(source, kind, group.layout).items():
-                    found.setdefault(field, {}).update(dict.fromkeys(names))
-        return {field: tuple(found[field]) for field in UNITS if field in found}
+                    joints.setdefault(field, {}).update(dict.fromkeys(names))
+        return {field: tuple(joints[field]) for field in UNITS if field in joints}
 
     def logged(
-        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+        self, topics: Mapping[str, Sequence[str]], window_ns: Window
     ) -> dict[tuple[str, str], list[JointRows]]:
         """Return messages as they were logged, those of a window of log times.
 
         Args:
-            wanted: Topic to fields.
+            topics: Topic to fields.
             window_ns: Half-open window of log times [Unix ns]; None for open ends. Trajectories are
                 returned whole, whatever the window.
 
@@ -200,9 +200,9 @@ class JointReader:
             MissingChannelError: If the session has no such topic.
             DataError: If a topic has no joints, or there is no such field.
         """
-        found = self._topics.read(self.requests(wanted), window_ns)
-        keys = [(name, field) for name, fields in wanted.items() for field in fields]
-        rows = {key: self._rows(*key, found) for key in keys}
+        messages = self._topics.read(self.requests(topics), window_ns)
+        keys = [(name, field) for name, fields in topics.items() for field in fields]
+        rows = {key: self._rows(*key, messages) for key in keys}
         for (name, _), several in rows.items():
             for sentence in one_name_sentences(row.names for row in several):
                 self._warn(f"{name}: {sentence}")
@@ -210,7 +210,7 @@ class JointReader:
 
     def signals(
         self,
-        wanted: Mapping[str, Sequence[str]],
+        topics: Mapping[str, Sequence[str]],
         messages: Mapping[str, Messages],
         window_ns: Window,
     ) -> dict[tuple[str, str], JointSignals]:
@@ -226,25 +226,25 @@ class JointReader:
         Raises:
             MissingChannelError: If a topic never carries a field.
         """
-        keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
+        keys = [(topic, field) for topic, fields in topics.items() for field in fields]
         series = {key: self._series(*key, messages, window_ns) for key in keys}
         times = {key: list(channel.t_ns) for key, channel in series.items()}
         for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
-            own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
-            stamped = [series[key] for key in own]
+            shifted = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
+            stamped = [series[key] for key in shifted]
             offsets = self._offset_series(offset_topic, messages, stamped, window_ns)
             if not any(values.any() for values in offsets.values):
                 continue  # sampled together
-            if offset_topic in wanted:
+            if offset_topic in topics:
                 offsets = _copied(offsets)
-            times |= zip(own, own_times(stamped, offsets), strict=True)
-            known = set(offsets.names)
-            for key in own:
+            times |= zip(shifted, own_times(stamped, offsets), strict=True)
+            names = set(offsets.names)
+            for key in shifted:
                 for name in series[key].names:
-                    if name not in known:
+                    if name not in names:
                         self._warn(f"{offset_topic} has no {name}: its message stamps are used")
         shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
-        cuts = {each: cut(t_ns, window_ns) for each, t_ns in shared.items()}
+        cuts = {key: cut(t_ns, window_ns) for key, t_ns in shared.items()}
         return {key: self._signals(key, series[key], times[key], cuts) for key in keys}
 
     def _offset_topic(self, topic: str) -> str | None:
@@ -262,9 +262,9 @@ class JointReader:
         if topic in self._offsets:
             return _copied(self._offsets[topic])
         offsets = self._series(topic, "position", messages, window_ns)
-        first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
-        known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
-        if known or window_ns[0] is None:
+        first = min((int(t[0]) for series in stamped for t in series.t_ns if len(t)), default=0)
+        covered = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
+        if covered or window_ns[0] is None:
             return offsets
         whole = self._topics.read({topic: ["position"]}, (None, None))
         self._offsets[topic] = self._series(topic, "position", whole)  # such topics are small
@@ -300,8 +300,8 @@ class JointReader:
             named = "" if str(self._path) in str(error) else f"{self._path}: "
             raise DataError(f"{named}{error}") from None
 
-    def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
-        for name, fields in wanted.items():
+    def _check(self, topics: Mapping[str, Sequence[str]]) -> None:
+        for name, fields in topics.items():
             self._check_source(self._source(name)[0])
             for field in fields:
                 if field not in UNITS:
@@ -323,12 +323,12 @@ class JointReader:
             )
         return JointSeries(*merge_rows(rows, name, field, self._warn))
 
-    def _rows(self, name: str, field: str, found: Mapping[str, Messages]) -> list[JointRows]:
+    def _rows(self, name: str, field: str, by_topic: Mapping[str, Messages]) -> list[JointRows]:
         """Return one field of a topic, with stamps on the log's clock."""
         source, kind = self._source(name)
         if kind == TRAJECTORY:
             return self._points(source, field)
-        messages = found[source.topic]
+        messages = by_topic[source.topic]
         try:
             rows = [rows_of(source, kind, group, field) for group in messages.groups]
         except DataError as error:
@@ -342,14 +342,14 @@ class JointReader:
         """Return the points of the trajectories of a topic, at their own times."""
         topic = source.topic
         every = self._read_trajectories(topic)
-        stamped = any(one.stamp_ns for one in every)
+        stamped = any(trajectory.stamp_ns for trajectory in every)
         shift_ns = self._clock.shift_ns(topic) if stamped else 0
-        found, replaced = points_in_force(every, field, shift_ns)
+        points, replaced = points_in_force(every, field, shift_ns)
         if replaced:
             self._warn(
                 f"{topic}: {replaced} points were replaced by a later trajectory before their time"
             )
-        return [JointRows(names, t_ns, t_ns, values) for names, t_ns, values in found]
+        return [JointRows(names, t_ns, t_ns, values) for names, t_ns, values in points]
 
     def _read_trajectories(self, topic: str) -> list[JointTrajectory]:
         if topic not in self._trajectories:
@@ -384,8 +384,8 @@ class JointReader:
         )
         chain = self._chain()
         there, of_chain = set(names), set(chain)
-        known = [name for name in chain if name in there]
-        order = (*known, *(name for name in names if name not in of_chain))
+        ordered = [name for name in chain if name in there]
+        order = (*ordered, *(name for name in names if name not in of_chain))
         return signals if order == names else signals.select(order)
 
     def _general_rows(
@@ -419,7 +419,9 @@ class JointReader:
         """Return the fields that a source has in a window of sampling times."""
         if kind == TRAJECTORY:
             every = self._trajectories[source.topic]
-            return [name for name in UNITS if any(one.values[name].size for one in every)]
+            return [
+                name for name in UNITS if any(trajectory.values[name].size for trajectory in every)
+            ]
         window_ns = widened(window_ns, SLACK_NS)
         paths = leaf_paths(source, kind, UNITS)
         groups = self._topics.read({source.topic: paths}, window_ns)[source.topic].groups

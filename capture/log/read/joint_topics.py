@@ -82,19 +82,19 @@ def joint_names(topics: Topics) -> dict[str, tuple[str, ...]]:
     for topic in _of_joints(topics):
         with suppress(DataError):  # a damaged schema: reported where the topic is read
             decoders[topic] = topics.decoder(topic)
-    found: dict[str, dict[str, None]] = {topic: {} for topic in decoders}
+    joints: dict[str, dict[str, None]] = {topic: {} for topic in decoders}
     looked_at, pending = Counter[str](), set(decoders)
     for topic, message in topics.raw_of(pending):
         looked_at[topic] += 1
         try:
-            own = _joints(decoders[topic](message))
+            carried = _joints(decoders[topic](message))
         except DataError:  # a damaged message: likewise
-            found[topic], own = {}, []
+            joints[topic], carried = {}, []
             pending.discard(topic)
-        found[topic] |= dict.fromkeys(own)
-        if len(own) > 1 or looked_at[topic] == _LOOKED_AT:  # all joints in one message
+        joints[topic] |= dict.fromkeys(carried)
+        if len(carried) > 1 or looked_at[topic] == _LOOKED_AT:  # all joints in one message
             pending.discard(topic)
-    return {topic: tuple(names) for topic, names in found.items() if names}
+    return {topic: tuple(names) for topic, names in joints.items() if names}
 
 
 def _of_joints(topics: Topics) -> list[str]:
@@ -121,7 +121,7 @@ def _joints(message: Any) -> list[str]:
     if hasattr(message, "interface_values"):
         names = distinct_names(message.joint_names)
         pairs = zip(names, message.interface_values, strict=False)
-        return [name for name, one in pairs if "position" in one.interface_names]
+        return [name for name, entry in pairs if "position" in entry.interface_names]
     return list(
         distinct_names(getattr(message, "joint_names", None) or getattr(message, "name", ()))
     )
@@ -134,9 +134,9 @@ def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) 
         JointSetError: If they are not the same; names those that only one of them has.
     """
     every: Mapping[str, tuple[str, ...]] = joint_names(topics)
-    known = set(joints)
-    own = {topic: names for topic, names in every.items() if not known.isdisjoint(names)}
-    if not own:
+    expected = set(joints)
+    shared = {topic: names for topic, names in every.items() if not expected.isdisjoint(names)}
+    if not shared:
         has = "; ".join(
             f"{topic} has {some_names(names, _MOST_LISTED)}" for topic, names in every.items()
         )
@@ -144,8 +144,8 @@ def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) 
             f"{path}: none of its joints is of {robot}, which has "
             f"{some_names(joints, _MOST_LISTED)}; {has or 'it has no topic of joints'}"
         )
-    logged = dict.fromkeys(name for names in own.values() for name in names)
-    strange = [name for name in logged if name not in known]
+    logged = dict.fromkeys(name for names in shared.values() for name in names)
+    strange = [name for name in logged if name not in expected]
     missing = [name for name in joints if name not in logged]
     if strange or missing:
         faults = [
@@ -212,7 +212,7 @@ def _robots(
     for command in commands:
         space = command.topic.rpartition("/")[0]
         of_it = (response for response in responses if response.topic.rpartition("/")[0] == space)
-        state = next((one for one in of_it if one.topic != command.topic), None)
+        state = next((candidate for candidate in of_it if candidate.topic != command.topic), None)
         if state is not None and {*command.joints} & {*state.joints}:
             pairs.setdefault(space, (command, state))
     every = Counter(name for _, state in pairs.values() for name in {*state.joints})
@@ -223,7 +223,7 @@ def _robots(
 
 def _sorted(candidates: Iterable[_Candidate], without: str) -> list[_Candidate]:
     kept = (candidate for candidate in candidates if candidate.name != without)
-    return sorted(kept, key=lambda one: (one.rank, -one.count, one.name))
+    return sorted(kept, key=lambda candidate: (candidate.rank, -candidate.count, candidate.name))
 
 
 class JointTopicFinder:
@@ -273,24 +273,28 @@ class JointTopicFinder:
         robots = _robots(commands, responses)
         if len(search) > 1 and robots:
             return JointTopics(quantities=quantities, notes=notes, robots=robots)
-        known = every.get(response, ())
+        response_joints = every.get(response, ())
         if COMMAND_TOPIC in search and commands:
             # Of several controllers one that has joints of the responses, of several robots theirs.
             best = min(
                 commands,
-                key=lambda one: (
-                    known and not {*one.joints} & {*known},
-                    one.rank,
-                    (one.name, response) not in robots,
+                key=lambda candidate: (
+                    response_joints and not {*candidate.joints} & {*response_joints},
+                    candidate.rank,
+                    (candidate.name, response) not in robots,
                 ),
             )
             command = taken["commands"] = best.name
         if RESPONSE_TOPIC in search and responses:
             source = joint_source(command, channels)
-            own = "" if source is None else source.topic
+            command_topic = "" if source is None else source.topic
             best = min(
                 responses,
-                key=lambda one: (one.rank, one.topic != own, (command, one.name) not in robots),
+                key=lambda candidate: (
+                    candidate.rank,
+                    candidate.topic != command_topic,
+                    (command, candidate.name) not in robots,
+                ),
             )
             if (
                 best.rank < _UNNAMED
@@ -300,16 +304,16 @@ class JointTopicFinder:
         if set(every.get(response, ())).isdisjoint(self._names_of(command, every)):
             # Joints of another part of the robot: a controller has its own states beside them.
             source = joint_source(command, channels)
-            own = [
+            beside = [
                 response
                 for response in responses
                 if source is not None and response.topic == source.topic
             ]
-            if own and response == RESPONSE_TOPIC:
-                response = taken["positions"] = own[0].name
+            if beside and response == RESPONSE_TOPIC:
+                response = taken["positions"] = beside[0].name
         others = [command.name for command in (*commands, *responses)]
         arrays = [topic for topic, kind, _ in self._joint_topics() if kind in FLOAT_ARRAYS]
-        taken_topics = {one.topic for one in commands if one.name == command}
+        taken_topics = {candidate.topic for candidate in commands if candidate.name == command}
         others += [f"{topic}:JOINT,..." for topic in arrays if topic not in taken_topics]
         others = [name for name in dict.fromkeys(others) if name not in (command, response)]
         notes = (*_notes(taken, others), *self._order_notes(command, response), *notes)
@@ -368,7 +372,9 @@ class JointTopicFinder:
             return self._joints
         states = _sorted(self._responses(self._every), topic)
         named = (state for state in states if len(state.joints) == width > 0)
-        first = next((one for one in named if not any("," in name for name in one.joints)), None)
+        first = next(
+            (state for state in named if not any("," in name for name in state.joints)), None
+        )
         if first is None:
             return ()
         self._named_after[topic] = first.name
@@ -394,11 +400,13 @@ class JointTopicFinder:
         for topic, kind, count in self._joint_topics():
             words, joints = _words(topic), every.get(topic, ())
             if kind == CONTROLLER_STATE:
-                for one in self._filled(topic, COMMAND_PARTS)[:1]:
-                    yield _Candidate(f"{topic}.{one}", topic, 0, count, joints)
+                for part in self._filled(topic, COMMAND_PARTS)[:1]:
+                    yield _Candidate(f"{topic}.{part}", topic, 0, count, joints)
             elif kind in FLOAT_ARRAYS:
-                if _of_angles(topic) and (own := self._joints_of(topic)):
-                    yield _Candidate(f"{topic}:{','.join(own)}", topic, 3, count, own)
+                if _of_angles(topic) and (array_joints := self._joints_of(topic)):
+                    yield _Candidate(
+                        f"{topic}:{','.join(array_joints)}", topic, 3, count, array_joints
+                    )
             elif kind == TRAJECTORY:
                 yield _Candidate(topic, topic, 2, count, joints)
             elif words & _COMMAND_WORDS:
@@ -408,8 +416,8 @@ class JointTopicFinder:
         for topic, kind, count in self._joint_topics():
             joints = every.get(topic, ())
             if kind == CONTROLLER_STATE:
-                for one in self._filled(topic, STATE_PARTS)[:1]:
-                    yield _Candidate(f"{topic}.{one}", topic, 1, count, joints)
+                for part in self._filled(topic, STATE_PARTS)[:1]:
+                    yield _Candidate(f"{topic}.{part}", topic, 1, count, joints)
             elif kind == DYNAMIC_STATE:
                 yield _Candidate(topic, topic, 2, count, joints)
             elif kind == JOINT_STATE and not _words(topic) & _COMMAND_WORDS:
@@ -433,23 +441,23 @@ class JointTopicFinder:
 
     def _quantities(self) -> tuple[dict[str, str], tuple[str, ...]]:
         """Return the further quantities that DynamicJointStates have, and notes on the rest."""
-        found: dict[str, str] = {}
+        quantities: dict[str, str] = {}
         notes: list[str] = []
         for topic, channel in self._topics.channels.items():
             if channel.type_name != DYNAMIC_STATE or not channel.count:
                 continue
             layout = self._first_layout(topic)
             every = interfaces(layout).values() if layout else ()
-            own = dict.fromkeys(one for each in every for one in each)
+            carried = dict.fromkeys(name for names in every for name in names)
             for interface in INTERFACE_UNITS:
                 usual = f"/joint_{interface}"
-                if interface in own and usual not in self._topics.channels:
-                    found.setdefault(usual, f"{topic}.{interface}")
-            rest = [one for one in own if one not in UNITS and one not in INTERFACE_UNITS]
+                if interface in carried and usual not in self._topics.channels:
+                    quantities.setdefault(usual, f"{topic}.{interface}")
+            rest = [name for name in carried if name not in UNITS and name not in INTERFACE_UNITS]
             if rest:
                 listed = some_names(rest, _FEW_LISTED)
                 notes.append(f"{topic} has interfaces that aren't analysed: {listed}")
-        return found, tuple(notes)
+        return quantities, tuple(notes)
 
     def _filled(self, topic: str, parts: Sequence[str]) -> list[str]:
         """Return the parts of a controller state that have positions in its first message."""
@@ -488,6 +496,6 @@ def _words(topic: str) -> set[str]:
 def _notes(taken: Mapping[str, str], others: Sequence[str]) -> tuple[str, ...]:
     if not taken:
         return ()
-    found = " and ".join(f"{kind} on {name}" for kind, name in taken.items())
+    sentence = " and ".join(f"{kind} on {name}" for kind, name in taken.items())
     rest = f"; other joints: {some_names(others, _FEW_LISTED)}" if others else ""
-    return (f"{found}, found by type{rest} ({HOW_TO_CHOOSE})",)
+    return (f"{sentence}, found by type{rest} ({HOW_TO_CHOOSE})",)

@@ -128,15 +128,15 @@ class OpenLog:
 
     def joint_orders(self, topic: str, window_ns: Window) -> list[tuple[str, ...]]:
         """See :meth:`.SessionView.joint_orders`."""
-        found = self.topics.read({topic: ()}, window_ns)[topic]
-        orders = dict.fromkeys(names_of(group.layout) for group in found.groups)
-        return [*orders, *([()] if found.unread else [])]
+        messages = self.topics.read({topic: ()}, window_ns)[topic]
+        orders = dict.fromkeys(names_of(group.layout) for group in messages.groups)
+        return [*orders, *([()] if messages.unread else [])]
 
     def tables(
-        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+        self, topics: Mapping[str, Sequence[str] | None], window_ns: Window
     ) -> dict[str, pd.DataFrame]:
         """Read tables in one pass, for a window of log times; see :meth:`.SessionView.table`."""
-        return self._as_tables(wanted, self.topics.read(wanted, window_ns))
+        return self._as_tables(topics, self.topics.read(topics, window_ns))
 
     def columns(
         self,
@@ -147,17 +147,17 @@ class OpenLog:
         requests: dict[str, Sequence[str] | None] = dict(self.joints.requests(joints))
         if twice := sorted(requests.keys() & tables.keys()):
             raise DataError(f"{', '.join(twice)}: ask for signals or for a table, not for both")
-        found = self.topics.read(requests | dict(tables), (None, None))
-        read = self._as_tables(tables, found)
-        return self.joints.signals(joints, found, (None, None)), read
+        messages = self.topics.read(requests | dict(tables), (None, None))
+        read = self._as_tables(tables, messages)
+        return self.joints.signals(joints, messages, (None, None)), read
 
     def frames(
         self, topic: str, window_ns: Window, dtype: np.dtype[np.void], label: str
     ) -> FrameArray:
         """Read frames of one kind; see :meth:`.SessionView.frames`."""
         batches: list[tuple[IntArray, IntArray, FrameArray]] = []
-        found = self.topics.read({topic: ["data"]}, window_ns)[topic]
-        for group in self._groups(topic, found):
+        messages = self.topics.read({topic: ["data"]}, window_ns)[topic]
+        for group in self._groups(topic, messages):
             data = group.values("data")
             if data.shape[1] % dtype.itemsize or label not in group.layout.strings.values():
                 kind = f"frames of {dtype.itemsize} bytes"
@@ -180,10 +180,10 @@ class OpenLog:
         return messages.groups
 
     def _as_tables(
-        self, wanted: Mapping[str, Sequence[str] | None], messages: dict[str, Messages]
+        self, topics: Mapping[str, Sequence[str] | None], messages: dict[str, Messages]
     ) -> dict[str, pd.DataFrame]:
         """Return tables of some messages, which are removed from ``messages`` one by one."""
-        return {topic: self._table(topic, messages.pop(topic)) for topic in wanted}
+        return {topic: self._table(topic, messages.pop(topic)) for topic in topics}
 
     def _table(self, topic: str, messages: Messages) -> pd.DataFrame:
         import pandas as pd  # a third of a second, which only tables need

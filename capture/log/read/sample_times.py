@@ -174,7 +174,7 @@ def longest_unbroken(
     """
     runs = [
         run
-        for t_ns in {id(each): each for each in times_ns}.values()
+        for t_ns in {id(times): times for times in times_ns}.values()
         for run in _runs(cut(t_ns, (start_ns, stop_ns))[1])
     ]
     joined = merged_ranges(sorted(runs), BREAK_S * NS)
@@ -301,20 +301,20 @@ def own_times(stamped: Sequence[JointSeries], offsets: JointSeries) -> list[list
         their stamps.
     """
     if all(_stamped_alike(series, offsets) for series in stamped):  # the usual case
-        own = [
+        shifted = [
             np.add(t_ns, _steps(values), out=values.view(np.int64))
             for t_ns, values in zip(offsets.t_ns, offsets.values, strict=True)
         ]
-        return [own for _ in stamped]
-    found: list[list[IntArray]] = []
+        return [shifted for _ in stamped]
+    times: list[list[IntArray]] = []
     for i, series in enumerate(stamped):
-        for earlier, known in zip(stamped[:i], found, strict=True):
+        for earlier, placed in zip(stamped[:i], times, strict=True):
             if _stamped_alike(series, earlier):
-                found.append(known)
+                times.append(placed)
                 break
         else:
-            found.append(_each_own(series, offsets))
-    return found
+            times.append(_each_own(series, offsets))
+    return times
 
 
 def _each_own(series: JointSeries, offsets: JointSeries) -> list[IntArray]:

@@ -138,14 +138,14 @@ class SessionView(ViewedSession):
 
     def joint_messages(
         self,
-        wanted: Mapping[str, Sequence[str]],
+        topics: Mapping[str, Sequence[str]],
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> dict[tuple[str, str], list[JointRows]]:
         """Return messages of joints as they were logged, in place of a series for each joint.
 
         Args:
-            wanted: Topic to fields, as for :meth:`joint_columns`.
+            topics: Topic to fields, as for :meth:`joint_columns`.
             start_ns: First log time wanted [Unix ns]; None for the start.
             stop_ns: One past the last log time wanted [Unix ns]; None for the end. Trajectories
                 are returned whole.
@@ -158,7 +158,7 @@ class SessionView(ViewedSession):
             DataError: If a topic has no joints or a field is none of the three.
         """
         window_ns = self._within(start_ns, stop_ns)
-        return self._of_joints(wanted, lambda logged: self._log.joints.logged(logged, window_ns))
+        return self._of_joints(topics, lambda logged: self._log.joints.logged(logged, window_ns))
 
     def message_type(self, topic: str) -> MessageType:
         """Return the type of a topic's messages.
@@ -185,12 +185,16 @@ class SessionView(ViewedSession):
             MissingChannelError: As :meth:`joint_topics`.
             DataError: As :meth:`joint_topics`.
         """
-        found = self.joint_topics(command, response)
-        known = {COMMAND_TOPIC: found.command, RESPONSE_TOPIC: found.response, **found.quantities}
-        names = {
-            topic: name for topic, name in known.items() if self.joint_channel(name) is not None
+        chosen = self.joint_topics(command, response)
+        sources = {
+            COMMAND_TOPIC: chosen.command,
+            RESPONSE_TOPIC: chosen.response,
+            **chosen.quantities,
         }
-        return self.view(rename=names) if found.renamed.keys() & names.keys() else self
+        names = {
+            topic: name for topic, name in sources.items() if self.joint_channel(name) is not None
+        }
+        return self.view(rename=names) if chosen.renamed.keys() & names.keys() else self
 
     def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
         """Return a view that reads a window [Unix ns]; its start and end stay those of this one."""
@@ -221,13 +225,13 @@ class SessionView(ViewedSession):
         if not self._names:
             return logged
         away = {*self._names, *self._names.values()}
-        found = {
+        channels = {
             name: replace(channel, topic=name)
             for name, topic in self._names.items()
             if (channel := logged.get(topic) or self._log.joints.channel(topic)) is not None
         }
-        found |= {topic: channel for topic, channel in logged.items() if topic not in away}
-        return MappingProxyType(found)
+        channels |= {topic: channel for topic, channel in logged.items() if topic not in away}
+        return MappingProxyType(channels)
 
     @property
     def duration_s(self) -> float:
@@ -266,7 +270,7 @@ class SessionView(ViewedSession):
 
     def joint_columns(
         self,
-        wanted: Mapping[str, Sequence[str]],
+        topics: Mapping[str, Sequence[str]],
         *,
         start_ns: int | None = None,
         stop_ns: int | None = None,
@@ -274,7 +278,7 @@ class SessionView(ViewedSession):
         """Return several quantities in one pass over the file.
 
         Args:
-            wanted: Topic to fields, e.g. ``{"/joint_states": ["position", "velocity"]}``.
+            topics: Topic to fields, e.g. ``{"/joint_states": ["position", "velocity"]}``.
             start_ns: First sampling time wanted [Unix ns]; None for the session's start.
             stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
 
@@ -286,7 +290,7 @@ class SessionView(ViewedSession):
             DataError: If a topic is not of JointStates or a field is none of the three.
         """
         window_ns = self._within(start_ns, stop_ns)
-        return self._of_joints(wanted, lambda logged: self._log.joints.read(logged, window_ns))
+        return self._of_joints(topics, lambda logged: self._log.joints.read(logged, window_ns))
 
     def joint_orders(self, topic: str) -> list[tuple[str, ...]]:
         """Return the lists of joints that messages of a JointState topic have, as they have them.
@@ -404,25 +408,25 @@ class SessionView(ViewedSession):
 
     def _of_joints(
         self,
-        wanted: Mapping[str, Sequence[str]],
+        topics: Mapping[str, Sequence[str]],
         read: Callable[[Mapping[str, Sequence[str]]], Mapping[tuple[str, str], _Found]],
     ) -> dict[tuple[str, str], _Found]:
         """Read fields by the names that the log has, and return them by those of the view."""
         self._on_read()
         logged: dict[str, list[str]] = {}
-        for topic, fields in wanted.items():
+        for topic, fields in topics.items():
             logged.setdefault(self._logged(topic), []).extend(fields)
-        found = read(logged)
-        keys = ((topic, field) for topic, fields in wanted.items() for field in fields)
-        return {(topic, field): found[self._logged(topic), field] for topic, field in keys}
+        results = read(logged)
+        keys = ((topic, field) for topic, fields in topics.items() for field in fields)
+        return {(topic, field): results[self._logged(topic), field] for topic, field in keys}
 
     def _tables(
-        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+        self, topics: Mapping[str, Sequence[str] | None], window_ns: Window
     ) -> dict[str, pd.DataFrame]:
         self._on_read()
-        logged = {self._logged(topic): paths for topic, paths in wanted.items()}
-        found = self._log.tables(logged, self._within(*window_ns))
-        return {topic: found[self._logged(topic)] for topic in wanted}
+        logged = {self._logged(topic): paths for topic, paths in topics.items()}
+        tables = self._log.tables(logged, self._within(*window_ns))
+        return {topic: tables[self._logged(topic)] for topic in topics}
 
     def _frames(
         self, topic: str, window_ns: Window, dtype: np.dtype[np.void], label: str
@@ -435,6 +439,6 @@ class SessionView(ViewedSession):
 
     def _within(self, start_ns: int | None, stop_ns: int | None) -> Window:
         """Return the part of a window that is in the view."""
-        starts = [one for one in (start_ns, self._window_ns[0]) if one is not None]
-        stops = [one for one in (stop_ns, self._window_ns[1]) if one is not None]
+        starts = [bound for bound in (start_ns, self._window_ns[0]) if bound is not None]
+        stops = [bound for bound in (stop_ns, self._window_ns[1]) if bound is not None]
         return max(starts, default=None), min(stops, default=None)

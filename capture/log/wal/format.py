@@ -205,12 +205,12 @@ def segment_files(folder: Path) -> list[tuple[int, int, Path]]:
     Raises:
         OSError: If the folder can't be listed.
     """
-    found: list[tuple[int, int, Path]] = []
+    segments: list[tuple[int, int, Path]] = []
     for path in folder.iterdir():
         match = _NAME.fullmatch(path.name)
         if match is not None:
-            found.append((DEFINITIONS if match[1] else MESSAGES, int(match[2]), path))
-    return sorted(found)
+            segments.append((DEFINITIONS if match[1] else MESSAGES, int(match[2]), path))
+    return sorted(segments)
 
 
 def pack_definition(record: Definition) -> tuple[int, bytes]:

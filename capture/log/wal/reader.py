@@ -123,17 +123,21 @@ class Recovery(Iterator[WalMessage]):
             raise LogError(self.folder, fault) from error
         if not files:
             raise NotALogError(self.folder, "no segment of a write-ahead log is in this folder")
-        found: list[_Found] = []
+        segments: list[_Found] = []
         for stream, number, path in files:
             opened = self._read_header(stream, number, path)
-            if opened is not None and found and opened.header.log_id != found[0].header.log_id:
+            if (
+                opened is not None
+                and segments
+                and opened.header.log_id != segments[0].header.log_id
+            ):
                 self.warnings.append(f"{path.name} is of another log; left out")
             elif opened is not None:
-                found.append(opened)
-        if not found:
+                segments.append(opened)
+        if not segments:
             reasons = "; ".join(self.warnings) or "its segments were made or removed meanwhile"
             raise NotALogError(self.folder, reasons)
-        return found
+        return segments
 
     def _read_header(self, stream: int, number: int, path: Path) -> _Found | None:
         try:
@@ -173,7 +177,7 @@ class Recovery(Iterator[WalMessage]):
                 self.warnings.append(f"definition {head.position} can't be read: {error}")
 
     def _read_messages(self) -> Iterator[WalMessage]:
-        known = {item.id for item in self.definitions if isinstance(item, Channel)}
+        defined = {item.id for item in self.definitions if isinstance(item, Channel)}
         unknown: set[int] = set()
         last = 0
         for head, payload in self._records(self._segments):
@@ -184,7 +188,7 @@ class Recovery(Iterator[WalMessage]):
                 self.before = gap
             last = head.position
             self.found += 1
-            if head.channel_id not in known:
+            if head.channel_id not in defined:
                 unknown.add(head.channel_id)
             yield WalMessage(
                 head.position,

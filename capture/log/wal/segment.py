@@ -114,7 +114,7 @@ class _Watch:
 
     def remove(self, mapping: _Mapping) -> None:
         with self._lock:
-            self._mappings = tuple(each for each in self._mappings if each is not mapping)
+            self._mappings = tuple(other for other in self._mappings if other is not mapping)
 
     def _set_handler(self) -> None:
         """Set the handler; if the system allows no callbacks from C, SIGBUS ends the process."""
@@ -163,8 +163,8 @@ def free_bytes(path: Path) -> int:
     existing = path.absolute()
     while not existing.exists():
         existing = existing.parent
-    found = os.statvfs(existing)
-    return found.f_bavail * found.f_frsize
+    disk = os.statvfs(existing)
+    return disk.f_bavail * disk.f_frsize
 
 
 def require_space(path: Path, needed: int) -> None:

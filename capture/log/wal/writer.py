@@ -456,10 +456,10 @@ def _prepare(folder: Path, *, force: bool) -> WalLock:
     _refuse_foreign(folder)
     lock = WalLock(folder)
     try:
-        found = segment_files(folder)
-        if found and not force:
+        segments = segment_files(folder)
+        if segments and not force:
             raise OutputExistsError(folder)
-        for _, _, path in found:
+        for _, _, path in segments:
             path.unlink()
     except OSError as error:
         lock.release()

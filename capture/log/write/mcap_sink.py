@@ -229,6 +229,6 @@ class _Guarded:
         self._stream.flush()
 
 
-def _same_id(what: str, wanted: int, given: int) -> None:
-    if wanted != given:
-        raise DataError(f"{what} has the id {wanted}; the next one is {given}")
+def _same_id(what: str, expected: int, given: int) -> None:
+    if expected != given:
+        raise DataError(f"{what} has the id {expected}; the next one is {given}")
