@@ -48,14 +48,14 @@ def find_apart(
     gains = _apart(np.array([exposure.responses[k].gain for k in kept]), 0.0)
     common = median_response([exposure.responses[k] for k in kept])
     slopes = _apart(np.array([_slope(course, common, k) for k in kept]), 0.0)
-    found = [Apart(names[kept[i]], "lag", *lag) for i, lag in lags.items()]
-    found += [Apart(names[kept[i]], "gain", *gains[i]) for i in gains if i in slopes]
-    return found
+    outliers = [Apart(names[kept[i]], "lag", *lag) for i, lag in lags.items()]
+    outliers += [Apart(names[kept[i]], "gain", *gains[i]) for i in gains if i in slopes]
+    return outliers
 
 
 def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[float, float]]]:
     """Return the values that lie apart by index, each with the least and largest of the others."""
-    found: dict[int, tuple[float, tuple[float, float]]] = {}
+    outliers: dict[int, tuple[float, tuple[float, float]]] = {}
     for i, value in enumerate(values.tolist()):
         others = np.delete(values, i)
         middle = float(np.median(others))
@@ -64,13 +64,13 @@ def _apart(values: FloatArray, least: float) -> dict[int, tuple[float, tuple[flo
         low, high = float(others.min()), float(others.max())
         away = max(value - high, low - value)
         if away > max(2 * (high - low), QUARTER * middle, least):
-            found[i] = value, (low, high)
-    return found
+            outliers[i] = value, (low, high)
+    return outliers
 
 
 def _slope(course: Course, common: JointResponse, k: int) -> float:
     """Return the slope of a joint's position over what a response makes of its command."""
-    known = course.present[k]
-    asked = Filtered(course.command[k][None, :], course.step_s).output(common)[0][known]
+    present = course.present[k]
+    asked = Filtered(course.command[k][None, :], course.step_s).output(common)[0][present]
     asked = asked - asked.mean()
-    return float(asked @ course.position[k][known]) / max(float(asked @ asked), TINY)
+    return float(asked @ course.position[k][present]) / max(float(asked @ asked), TINY)

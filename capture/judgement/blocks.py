@@ -167,12 +167,12 @@ def _excess_noise(left: FloatArray, weights: FloatArray, exposure: Exposure) -> 
         Ratios of mean squares, 1 or more, shape (k, b): against the joint's own usual one, and
         without that of a few blocks, which a motion that no response fits may have.
     """
-    noise, known = without_common(np.log(left + EPS**2), weights, exposure)
+    noise, remaining = without_common(np.log(left + EPS**2), weights, exposure)
     for k in range(len(noise)):
         if len(exposure.group(k)) < ENOUGH_LIKE:
             noise[k] = 0.0
             continue
-        noise[k] = np.where(known[k] > 0, noise[k] - _middle(noise[k, known[k] > 0]), 0.0)
+        noise[k] = np.where(remaining[k] > 0, noise[k] - _middle(noise[k, remaining[k] > 0]), 0.0)
     lasting = median_filter(noise, (1, 2 * REST_ERRORS + 1), mode="nearest")
     return np.exp(np.maximum(lasting, 0.0))
 
@@ -191,10 +191,10 @@ def _tamed(
         The residual, shape (n,), and the robust standard deviation of each block, shape (b,).
     """
     blocks = np.where(there, residual, np.nan)[: count * width].reshape(count, width)
-    known = np.isfinite(blocks).any(axis=1)
+    filled = np.isfinite(blocks).any(axis=1)
     middle, scale = np.zeros((2, count, 1))
-    middle[known] = np.nanmedian(blocks[known], axis=1, keepdims=True)
-    scale[known] = ROBUST * np.nanmedian(np.abs(blocks - middle)[known], axis=1, keepdims=True)
+    middle[filled] = np.nanmedian(blocks[filled], axis=1, keepdims=True)
+    scale[filled] = ROBUST * np.nanmedian(np.abs(blocks - middle)[filled], axis=1, keepdims=True)
     limited = np.clip(blocks, middle - TAME * scale, middle + TAME * scale)
     result = residual.copy()
     result[: count * width] = np.nan_to_num(limited).ravel()
@@ -268,8 +268,8 @@ def without_common(
         others = [j for j in exposure.group(k) if j != k]
         if len(others) < ENOUGH_LIKE - 1:
             continue
-        known = np.where(weights[others] > 0, values[others], np.nan)
+        measured = np.where(weights[others] > 0, values[others], np.nan)
         enough = np.sum(weights[others] > 0, axis=0) >= ENOUGH_LIKE - 1
-        result[k, enough] -= np.nanmedian(known[:, enough], axis=0)
+        result[k, enough] -= np.nanmedian(measured[:, enough], axis=0)
         compared[k, ~enough] = 0
     return result, compared

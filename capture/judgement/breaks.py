@@ -87,28 +87,28 @@ def find_breaks(course: Course, exposure: Exposure, usable: BoolArray) -> list[t
     moments = [moments_of(r * usable[k], r, starts, width) for k, r in enumerate(rows)]
     breaks = [breaks_of(moment) for moment in moments]
     block_s = width * course.step_s
-    found: list[tuple[float, Jump]] = []
-    for k, own in enumerate(breaks):
+    jumps: list[tuple[float, Jump]] = []
+    for k, candidate in enumerate(breaks):
         others = [breaks[j].change for j in exposure.group(k) if j != k]
-        change, error = _beside(own, others)
-        shown = (own.freedom >= 1) & (own.drop > own.left)
-        shown &= np.abs(change) > error * _limit(own.freedom, TERMS * joints * (count - 1))
-        shown &= _unexpected(own, change, len(others) >= ENOUGH_LIKE - 1, course.command[k])
+        change, error = _beside(candidate, others)
+        shown = (candidate.freedom >= 1) & (candidate.drop > candidate.left)
+        shown &= np.abs(change) > error * _limit(candidate.freedom, TERMS * joints * (count - 1))
+        shown &= _unexpected(candidate, change, len(others) >= ENOUGH_LIKE - 1, course.command[k])
         if not shown.any():
             continue
-        q, cut = np.unravel_index(int(np.argmax(np.where(shown, own.drop, 0.0))), shown.shape)
+        q, cut = np.unravel_index(int(np.argmax(np.where(shown, candidate.drop, 0.0))), shown.shape)
         size, half = float(change[q, cut]), float(error[q, cut])
         if not _matters(int(q), size, half, moments[k]):
             continue
         if _rests_on_one_block(int(q), int(cut), moments[k]):
             continue
         if QUANTITIES[q] == "gain":  # relative to before, when the joint responded at all
-            before = max(1 + float(own.before[q, cut]), QUARTER)
+            before = max(1 + float(candidate.before[q, cut]), QUARTER)
             size, half = size / before, half / before
         at_s = float(course.t_s[0]) + (int(cut) + 1) * block_s
         jump = Jump(k, QUANTITIES[q], size, half, at_s, inf, block_s)
-        found.append((float(own.drop[q, cut]), jump))
-    return found
+        jumps.append((float(candidate.drop[q, cut]), jump))
+    return jumps
 
 
 def _beside(breaks: Breaks, others: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -187,8 +187,8 @@ def breaks_of(moments: FloatArray) -> Breaks:
     inverse = np.linalg.inv(scaled + EPS * np.eye(TERMS)) / np.outer(scale, scale)
     common = inverse @ target
     most = float(total[TERMS, TERMS] - common @ target)
-    each = [_change_of(q, moments, after, inverse, common) for q in range(TERMS)]
-    change, before, error, freedom, drop = (np.stack(rows) for rows in zip(*each, strict=True))
+    changes = [_change_of(q, moments, after, inverse, common) for q in range(TERMS)]
+    change, before, error, freedom, drop = (np.stack(rows) for rows in zip(*changes, strict=True))
     explained = drop + drop[0] * (np.arange(TERMS) > 0)[:, None]
     return Breaks(change, before, error, freedom, drop, np.maximum(most - explained, 0.0))
 
@@ -205,9 +205,9 @@ def _change_of(
         change = change.beside(step, gram, behind)
     part = change.parts(behind)
     free: FloatArray = np.einsum("cbi,bij,cbj->c", part, gram, part)
-    known = free > np.sqrt(EPS) * float(moments[:, q, q].sum())
-    free = np.where(known, free, 1.0)
-    size = np.where(known, np.einsum("cbi,bi->c", part, target) / free, 0.0)
+    determined = free > np.sqrt(EPS) * float(moments[:, q, q].sum())
+    free = np.where(determined, free, 1.0)
+    size = np.where(determined, np.einsum("cbi,bi->c", part, target) / free, 0.0)
     # Of each block: the sum of the free part of z [t >= t0] times what (1) leaves, and its power.
     terms: FloatArray = np.broadcast_to(common, part.shape) + size[:, None, None] * part
     if q > 0:
@@ -218,7 +218,7 @@ def _change_of(
     scores = np.einsum("cbi,cbi->cb", part, target - np.einsum("bij,cbj->cbi", gram, terms))
     power = np.einsum("cbi,bij,cbj->cb", part, gram, part)
     blocks = free**2 / np.maximum(np.sum(power**2, axis=1), TINY)
-    freedom = np.where(known, blocks - 2, 0.0)  # a mean before and one after
+    freedom = np.where(determined, blocks - 2, 0.0)  # a mean before and one after
     squares = np.maximum(np.sum(scores**2, axis=1), TINY)
     rho = np.clip(np.sum(scores[:, 1:] * scores[:, :-1], axis=1) / squares, 0, COVERAGE)
     squares *= (1 + rho) / (1 - rho) * blocks / np.maximum(freedom, 1)

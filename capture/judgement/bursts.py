@@ -43,15 +43,15 @@ def find_bursts(course: Course, exposure: Exposure, usable: BoolArray) -> dict[i
     count = usable.sum(axis=1)
     far = np.array([_far(residual[k][usable[k]]) for k in range(len(residual))], dtype=np.float64)
     share = far / np.maximum(count, 1)
-    found: dict[int, float] = {}
+    bursts: dict[int, float] = {}
     for k in range(len(residual)):
         others = [j for j in exposure.group(k) if j != k and count[j]]
         if len(others) < ENOUGH_LIKE - 1:
             continue
         usual = min(NEGLIGIBLE + 2 * float(np.median(share[others])), 1.0)
         if far[k] and bdtrc(far[k] - 1, count[k], usual) < RARE:
-            found[k] = float(share[k])
-    return found
+            bursts[k] = float(share[k])
+    return bursts
 
 
 def _far(residual: FloatArray) -> int:

@@ -53,10 +53,10 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
     """
     usable = usable & _running(course, exposure)
     blocks = blocks_of(course, exposure, usable)
-    found = [] if blocks is None else _jumps(blocks, exposure)
-    found += find_breaks(course, exposure, usable)
+    jumps = [] if blocks is None else _jumps(blocks, exposure)
+    jumps += find_breaks(course, exposure, usable)
     best: dict[int, tuple[float, Jump]] = {}
-    for drop, jump in found:
+    for drop, jump in jumps:
         if jump.joint not in best or drop > best[jump.joint][0]:
             best[jump.joint] = drop, jump
     return [best[k][1] for k in sorted(best)]
@@ -64,12 +64,12 @@ def find_jumps(course: Course, exposure: Exposure, usable: BoolArray) -> list[Ju
 
 def _jumps(blocks: Blocks, exposure: Exposure) -> list[tuple[float, Jump]]:
     """Return changes and the part of the sum of squares that each explains."""
-    found: list[tuple[float, Jump]] = []
+    jumps: list[tuple[float, Jump]] = []
 
     def offer(k: int, quantity: str, shift: Shift | None) -> None:
         if shift is not None and _matters(quantity, k, exposure, shift, blocks):
             drop = 0.0 if quantity == "noise" else shift.drop  # it is what nothing else explains
-            found.append((drop, _jump(k, quantity, shift, blocks.edges_s)))
+            jumps.append((drop, _jump(k, quantity, shift, blocks.edges_s)))
 
     for q, quantity in enumerate(QUANTITIES):
         values, weights = without_common(blocks.values[q], blocks.weights[q], exposure)
@@ -86,7 +86,7 @@ def _jumps(blocks: Blocks, exposure: Exposure) -> list[tuple[float, Jump]]:
             offer(k, quantity, shift)
             if quantity == "offset":
                 offer(k, "drift", drift_of(value, weight, rho, tests))
-    return found
+    return jumps
 
 
 def _running(course: Course, exposure: Exposure) -> BoolArray:

@@ -100,14 +100,14 @@ def exposure_of(
         if len(group) >= ENOUGH_LIKE:
             usual = float(np.quantile(lost[group], WHOLE))
             of_like[k] = max(2 * REST_ERRORS * usual, HALF * float(np.ptp(course.command[k])))
-        known = sound or [r for r in responses if responds(r)]
+        responding = sound or [r for r in responses if responds(r)]
         settling[k] = (
-            np.median([r.delay_s + SETTLED * r.constant_s for r in known])
-            if known
+            np.median([r.delay_s + SETTLED * r.constant_s for r in responding])
+            if responding
             else _half_cycle_s(course.command[k], course.step_s)  # all may be as late as that
         )
-    own = np.minimum(lost, LARGEST_REST_RAD)
-    least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + own), of_like)
+    limited = np.minimum(lost, LARGEST_REST_RAD)
+    least = np.minimum(np.maximum(REST_ERRORS * rest, LARGEST_REST_RAD + limited), of_like)
     settling += course.step_s
     return Exposure(healthy, fitted, tuple(responses), like, rest, least, settling)
 
@@ -184,7 +184,7 @@ def window_ranges(values: FloatArray, lengths: Sequence[int]) -> list[FloatArray
         For each length m: largest minus smallest value from each start, shape (n - m + 1,).
     """
     high, low, width = values, values, 1
-    found: list[FloatArray] = []
+    ranges: list[FloatArray] = []
     for length in lengths:
         while 2 * width <= length:
             high = np.maximum(high[:-width], high[width:])
@@ -193,8 +193,8 @@ def window_ranges(values: FloatArray, lengths: Sequence[int]) -> list[FloatArray
         rest = length - width
         top = np.maximum(high[: high.size - rest], high[rest:]) if rest else high
         bottom = np.minimum(low[: low.size - rest], low[rest:]) if rest else low
-        found.append(top - bottom)
-    return found
+        ranges.append(top - bottom)
+    return ranges
 
 
 def covered(starts: BoolArray, length: int, size: int) -> BoolArray:

@@ -267,10 +267,15 @@ def _explain_more(exposure: Exposure, naming: Naming) -> bool:
     for alternative in naming.alternatives:
         if alternative.kind is ExplanationKind.PERMUTED:
             moved = [k for k, j in enumerate(alternative.permutation) if k != j]
-            own = [exposure.responses[k] for k in moved]
-            if len(moved) < WHOLE * len(alternative.permutation) or not all(map(responds, own)):
+            responses = [exposure.responses[k] for k in moved]
+            if len(moved) < WHOLE * len(alternative.permutation) or not all(
+                map(responds, responses)
+            ):
                 return False
-            if any(r.explained < alternative.explained[k] for k, r in zip(moved, own, strict=True)):
+            if any(
+                r.explained < alternative.explained[k]
+                for k, r in zip(moved, responses, strict=True)
+            ):
                 return False
     return True
 

@@ -101,8 +101,8 @@ def _lines(
     for k in range(count):
         amplitude[k], error[k], tail[k] = _tested(residual[k], padded, TAPERS)
         if few < TAPERS:
-            found = _tested(residual[k], padded, few)
-            for values, other in zip((amplitude, error, tail), found, strict=True):
+            tested = _tested(residual[k], padded, few)
+            for values, other in zip((amplitude, error, tail), tested, strict=True):
                 values[k, slow] = other[slow]
     tests = 2 * count * course.t_s.size  # of the whole record and of its halves
     lines: list[SpectralLine] = []
@@ -145,12 +145,12 @@ def vibrates(course: Course, exposure: Exposure, k: int) -> bool:
 
     It is at a frequency at which the joint's command doesn't move, and no drift or step.
     """
-    own = _power(course.position[k] - exposure.fitted[k])
+    residual = _power(course.position[k] - exposure.fitted[k])
     asked = _power(course.command[k])
-    peak = int(np.argmax(own))  # in cycles a record
+    peak = int(np.argmax(residual))  # in cycles a record
     near = slice(max(peak - 2, 0), peak + 2 + 1)  # a line between two frequencies is in four
     own_share, asked_share = (
-        float(power[near].sum()) / max(float(power.sum()), TINY) for power in (own, asked)
+        float(power[near].sum()) / max(float(power.sum()), TINY) for power in (residual, asked)
     )
     return peak > REST_ERRORS and own_share > HALF and asked_share < NEGLIGIBLE
 

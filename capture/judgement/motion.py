@@ -167,10 +167,10 @@ def _asked(command_s: FloatArray, t_s: FloatArray) -> BoolArray:
     """Mark the steps that are in no gap between two commands."""
     intervals = np.diff(command_s)
     gaps = np.flatnonzero(intervals > 2 * MISSING * float(np.quantile(intervals, COVERAGE)))
-    known = np.ones(t_s.size, dtype=np.bool_)
+    covered = np.ones(t_s.size, dtype=np.bool_)
     for gap in gaps.tolist():
-        known &= (t_s <= command_s[gap]) | (t_s >= command_s[gap + 1])
-    return known
+        covered &= (t_s <= command_s[gap]) | (t_s >= command_s[gap + 1])
+    return covered
 
 
 def rises_of(command: FloatArray) -> IntArray:

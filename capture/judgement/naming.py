@@ -149,7 +149,9 @@ def permutation_of(commands: FloatArray, positions: FloatArray, step_s: float) -
         return Naming(NamingVerdict.FITS, (named,), (), alike)
     # The lag as named is large: names that are shifted would leave a smaller one.
     shifted = [shift for shift in _shifts(pairs) if shift.delay_s < named.delay_s]
-    earlier = sorted((one for one in shifted if _as_good(one, named)), key=lambda one: one.delay_s)
+    earlier = sorted(
+        (shift for shift in shifted if _as_good(shift, named)), key=lambda shift: shift.delay_s
+    )
     verdict = NamingVerdict.EITHER if earlier else NamingVerdict.FITS
     return Naming(verdict, (*earlier, named), (), alike)
 
@@ -166,13 +168,13 @@ def _permuted(
         return fits
     decided_by = _deciding(best, named)
     regular = _shifts(pairs)
-    along = best.permutation in [one.permutation for one in regular]
+    along = best.permutation in [shift.permutation for shift in regular]
     # One joint of another lag can be had by moving many that are next to each other in phase.
     gained = best.explained - np.diagonal(pairs.explained[pairs.delay_s == best.delay_s][0])
     few = decided_by and len(decided_by) < max(2, TELLING * moved.size)
     if not along and (few or np.mean(gained[moved] > AS_GOOD) < WHOLE):
         return fits
-    rivals = [one for one in regular if _as_good(one, best)]
+    rivals = [shift for shift in regular if _as_good(shift, best)]
     rivals = [rival for rival in rivals if rival.permutation != best.permutation]
     if decided_by:
         inverted = _inverted(pairs, named, decided_by)
@@ -186,7 +188,7 @@ def _permuted(
         alone = True
     if alone:
         rivals.append(replace(named, kind=ExplanationKind.OWN_LAGS))
-    standing = sorted((best, *rivals), key=lambda one: one.delay_s)
+    standing = sorted((best, *rivals), key=lambda explanation: explanation.delay_s)
     verdict = NamingVerdict.EITHER if rivals else NamingVerdict.PERMUTED
     return Naming(verdict, tuple(standing), decided_by, alike)
 

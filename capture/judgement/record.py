@@ -41,12 +41,12 @@ def record_faults(motions: Sequence[RecordedJoint]) -> dict[str, Fault]:
         return _lost(motion), *_repeats(motion), _wraps(motion)
 
     total = sum(motion.position.t_s.size for motion in sampled)
-    found = in_threads(counts, sampled, total)
-    usual_lost = float(np.median([lost for lost, *_ in found] or [0.0]))
-    usual_stale = float(np.median([repeats / of for _, repeats, of, _ in found if of] or [0.0]))
+    counted = in_threads(counts, sampled, total)
+    usual_lost = float(np.median([lost for lost, *_ in counted] or [0.0]))
+    usual_stale = float(np.median([repeats / of for _, repeats, of, _ in counted if of] or [0.0]))
     expected = min(STALE + 2 * usual_stale, 1.0)
     faults: dict[str, Fault] = {}
-    for motion, (missing, repeats, fast, wrapped) in zip(sampled, found, strict=True):
+    for motion, (missing, repeats, fast, wrapped) in zip(sampled, counted, strict=True):
         name = motion.name
         if wrapped:
             faults[name] = _whole(name, ("wrapped_sensor",), wrapped)

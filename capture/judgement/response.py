@@ -149,15 +149,15 @@ def fit_response(
     there = present[::stride][parts]
     filtered = Filtered(c, stride * step_s)
     weight, bounds = there.astype(np.float64), _bounds(command, step_s)
-    found = _fitted(filtered, y, weight, bounds)
+    fitted = _fitted(filtered, y, weight, bounds)
     # A zero that drifts looks like gain and poles, the more so the slower the command is.
-    left = y - found[1].gain * filtered.output(found[1])
+    left = y - fitted[1].gain * filtered.output(fitted[1])
     drift = _line(left, parts - parts.mean(), weight)
     if np.var(left - drift) < HALF * np.var(left):
         level = _fitted(filtered, y - drift, weight, bounds)
-        if level[0] < HALF * found[0]:
+        if level[0] < HALF * fitted[0]:
             return level[1]
-    return found[1]
+    return fitted[1]
 
 
 def _line(values: FloatArray, along: FloatArray, weight: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ class RestOff:
 
 def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list[RestOff]:
     """Find the joints that rest off by more than healthy joints do."""
-    found: list[RestOff] = []
+    resting: list[RestOff] = []
     for k in range(course.position.shape[0]):
         off = _rests(course, exposure, stillness, k)
         rests = len(off)
@@ -48,8 +48,8 @@ def find_rests(course: Course, exposure: Exposure, stillness: Stillness) -> list
             off = [_middle(course, exposure, k)] if responds(exposure.responses[k]) else []
         most = max(off, key=abs, default=0.0)
         if abs(most) > LARGEST_REST_RAD:
-            found.append(RestOff(k, most, (min(off), max(off)), rests))
-    return found
+            resting.append(RestOff(k, most, (min(off), max(off)), rests))
+    return resting
 
 
 def _middle(course: Course, exposure: Exposure, k: int) -> float:

@@ -71,36 +71,38 @@ def noise_of(values: FloatArray, weights: FloatArray, rho: float) -> ShiftNoise:
     with two thirds of the degrees of freedom (von Neumann et al., Ann. Math. Stat. 12, 1941, doi
     10.1214/aoms/1177731746).
     """
-    known = weights > 0
-    if int(known.sum()) <= 2:
+    weighed = weights > 0
+    if int(weighed.sum()) <= 2:
         return UNKNOWN
-    scale = np.sqrt(weights[known])
-    whole, target = _whitened(scale, rho), _whitened(scale * values[known], rho)
+    scale = np.sqrt(weights[weighed])
+    whole, target = _whitened(scale, rho), _whitened(scale * values[weighed], rho)
     steps = np.diff(target - float(whole @ target) / float(whole @ whole) * whole)
     return ShiftNoise(max(float(np.mean(steps**2)) / 2, TINY), WHOLE * steps.size)
 
 
-def common_noise(noises: Sequence[ShiftNoise], own: ShiftNoise = UNKNOWN) -> ShiftNoise:
+def common_noise(noises: Sequence[ShiftNoise], joint_noise: ShiftNoise = UNKNOWN) -> ShiftNoise:
     """Estimate the noise of a joint from that of several like it (Smyth, section 6.2).
 
     The joints' own scatter is taken at its upper limit of 90 %; that of few joints weighs little,
     and not at all for one whose own noise is beyond theirs at the level of the judgement.
     """
-    known = [noise for noise in noises if noise.freedom > 0]
-    if len(known) < ENOUGH_LIKE - 1:
+    estimates = [noise for noise in noises if noise.freedom > 0]
+    if len(estimates) < ENOUGH_LIKE - 1:
         return UNKNOWN
-    half = np.array([noise.freedom for noise in known]) / 2
-    logs = np.log([noise.variance for noise in known]) - digamma(half) + np.log(half)
+    half = np.array([noise.freedom for noise in estimates]) / 2
+    logs = np.log([noise.variance for noise in estimates]) - digamma(half) + np.log(half)
     middle = float(np.median(logs))
     # The median distance isn't that of a joint which changed.
     scatter = (ROBUST * float(np.median(np.abs(logs - middle)))) ** 2
-    most = scatter * (len(known) - 1) / float(chdtri(len(known) - 1, FULL))
+    most = scatter * (len(estimates) - 1) / float(chdtri(len(estimates) - 1, FULL))
     excess = most - float(np.mean(polygamma(1, half)))
     pooled = 2 * float(half.sum())
     # trigamma(x) is above 1/x + 1/(2 x^2).
     freedom = pooled if excess <= 0 else min(pooled, (1 + np.sqrt(1 + 2 * excess)) / excess)
     variance = float(np.exp(middle + digamma(freedom / 2) - np.log(freedom / 2)))
-    beyond = own.variance > variance * float(fdtri(max(own.freedom, 1), freedom, 1 - LEVEL))
+    beyond = joint_noise.variance > variance * float(
+        fdtri(max(joint_noise.freedom, 1), freedom, 1 - LEVEL)
+    )
     return UNKNOWN if beyond else ShiftNoise(variance, float(freedom))
 
 
@@ -112,14 +114,14 @@ def without_single(values: FloatArray, weights: FloatArray) -> FloatArray:
     """
     result = weights.copy()
     for row, weight in zip(values, result, strict=True):
-        known = np.flatnonzero(weight > 0)
-        if known.size >= FEWEST:
-            value = row[known]
+        weighed = np.flatnonzero(weight > 0)
+        if weighed.size >= FEWEST:
+            value = row[weighed]
             middle = np.pad(np.median([value[:-2], value[1:-1], value[2:]], axis=0), 1, "edge")
             away = np.abs(value - middle)
             if away.any():
                 far = away > TAME * ROBUST * np.median(away[away > 0])
-                weight[known[far]] = 0.0
+                weight[weighed[far]] = 0.0
     return result
 
 
@@ -139,12 +141,12 @@ def correlation_of(values: FloatArray, weights: FloatArray) -> float:
     correlates the blocks around it.
     """
     halves = 1 if len(values) > 2 else 2
-    found: list[float] = []
+    correlations: list[float] = []
     for value, weight in zip(values, weights, strict=True):
         parts = np.array_split(value[weight > 0], halves)
         if sum(part.size for part in parts) >= FEWEST:
-            found.append(min(_correlation(part) for part in parts))
-    return min(max(float(np.median(found)), 0.0), COVERAGE) if found else 0.0
+            correlations.append(min(_correlation(part) for part in parts))
+    return min(max(float(np.median(correlations)), 0.0), COVERAGE) if correlations else 0.0
 
 
 def _correlation(values: FloatArray) -> float:
@@ -173,26 +175,26 @@ def largest_shift(
         compared: Whether like joints have taken off what a model leaves: then what is left is
             chance, and the plain difference of means must be beyond it, too.
     """
-    known = np.flatnonzero(weights > 0)
-    v, w = values[known], weights[known]
+    weighed = np.flatnonzero(weights > 0)
+    v, w = values[weighed], weights[weighed]
     # So many blocks of one weight know as much.
-    if known.size < FEWEST or float(w.sum()) ** 2 < FEWEST * float(w @ w):
+    if weighed.size < FEWEST or float(w.sum()) ** 2 < FEWEST * float(w @ w):
         return None
     best: tuple[float, Shift] | None = None
     for lasting in (True, False):
-        first, last = _runs(known, values.size, shortest, lasting=lasting)
+        first, last = _runs(weighed, values.size, shortest, lasting=lasting)
         if not first.size:
             continue
         change, outside, error = _fitted(v, w, first, last, rho, like=like)
         if compared:
             error = np.maximum(error, _plain_error(v, w, first, last, rho, like=like))
-        freedom = known.size - 2 - 1 + like.freedom  # two means, and where the run is
+        freedom = weighed.size - 2 - 1 + like.freedom  # two means, and where the run is
         limit = -float(stdtrit(freedom, LEVEL / 2 / 2 / tests / first.size))
         t = np.abs(change) / error
         k = int(np.argmax(t))
         if t[k] > limit and (best is None or t[k] / limit > best[0]):
-            start = 0 if first[k] == 0 else int(known[first[k]])
-            stop = values.size if last[k] == known.size else int(known[last[k] - 1]) + 1
+            start = 0 if first[k] == 0 else int(weighed[first[k]])
+            stop = values.size if last[k] == weighed.size else int(weighed[last[k] - 1]) + 1
             inner = float(w[first[k] : last[k]].sum())
             drop = float(change[k]) ** 2 / (1 / inner + 1 / max(float(w.sum()) - inner, TINY))
             means = _means(v, w, int(first[k]), int(last[k]))
@@ -209,11 +211,11 @@ def drift_of(values: FloatArray, weights: FloatArray, rho: float, tests: int) ->
         rho: Correlation from block to block.
         tests: Number of series that are looked at.
     """
-    known = np.flatnonzero(weights > 0)
-    if known.size < FEWEST:
+    weighed = np.flatnonzero(weights > 0)
+    if weighed.size < FEWEST:
         return None
-    v, w = values[known], weights[known]
-    along = known / max(values.size - 1, 1)
+    v, w = values[weighed], weights[weighed]
+    along = weighed / max(values.size - 1, 1)
     x = along - float(w @ along) / float(w.sum())
     power = float(w @ x**2)
     change = float(w @ (x * v)) / power
@@ -258,18 +260,18 @@ def _means(v: FloatArray, w: FloatArray, first: int, last: int) -> tuple[float, 
 
 
 def _runs(
-    known: IntArray, blocks: int, shortest: int, *, lasting: bool
+    weighed: IntArray, blocks: int, shortest: int, *, lasting: bool
 ) -> tuple[IntArray, IntArray]:
     """Return first block and the one after the last of runs to one end, or within.
 
     Of the blocks that are known; a run to one end is shortest in time, and half of it is known: in
     the first blocks a response settles.
     """
-    count = known.size
+    count = weighed.size
     if lasting:
         least = max(2, shortest // 2)
         cuts = np.arange(least, count - least + 1)
-        cuts = cuts[(known[cuts] >= shortest) & (known[cuts - 1] < blocks - shortest)]
+        cuts = cuts[(weighed[cuts] >= shortest) & (weighed[cuts - 1] < blocks - shortest)]
         half = cuts * 2 > count  # the shorter part is what changed
         first = np.where(half, cuts, 0)
         last = np.where(half, count, cuts)
@@ -297,9 +299,9 @@ def _fitted(
     sums = np.pad(np.cumsum([whole**2, whole * target], axis=1), ((0, 0), (1, 0)))
     after = np.minimum(last, v.size - 1)
     behind = np.where(last < v.size, -rho * scale[last - 1], 0.0)
-    own, of_target = sums[:, last] - sums[:, first + 1]
-    power = own + begin[first] ** 2 + behind**2
-    along = own + begin[first] * whole[first] + behind * whole[after]
+    inside, of_target = sums[:, last] - sums[:, first + 1]
+    power = inside + begin[first] ** 2 + behind**2
+    along = inside + begin[first] * whole[first] + behind * whole[after]
     moment = of_target + begin[first] * target[first] + behind * target[after]
     level, total = sums[0, -1], sums[1, -1]
     free = np.maximum(power - along**2 / level, TINY)

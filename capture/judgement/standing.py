@@ -155,8 +155,8 @@ def _effort(
     if here is None:
         return None
     others = [_size(other.effort, spans, inside=True) for other in like if other is not motion]
-    known = [size for size in others if size is not None]
-    usual = float(np.median(known)) if len(known) > AGAIN else None
+    sizes = [size for size in others if size is not None]
+    usual = float(np.median(sizes)) if len(sizes) > AGAIN else None
     if usual is None:
         usual = _size(motion.effort, spans, inside=False)
     return here / usual if usual else None
