@@ -114,9 +114,14 @@ class DecodedTopics:
         for decoded in samples:
             index = self._sensor_targets.index(decoded.signals)
             for member in self._sensor_targets.members(decoded.signals):
-                own = decoded.member == member
+                selected = decoded.member == member
                 column = "xyz".index(decoded.signals[0].axis or "x")
-                piece = (column, decoded.rows[own], decoded.t_ns[own], decoded.values[own])
+                piece = (
+                    column,
+                    decoded.rows[selected],
+                    decoded.t_ns[selected],
+                    decoded.values[selected],
+                )
                 pieces.setdefault(int(index[member]), []).append(piece)
         for sensor, own_pieces in pieces.items():
             messages += self._sensors[sensor].messages(own_pieces)
@@ -157,11 +162,11 @@ class _Targets:
     def _of(
         self, signals: tuple[BusSignal, ...]
     ) -> tuple[tuple[BusSignal, ...], IntArray, list[int]]:
-        known = self._known.get(id(signals))  # kept with its key, so that the id stays its own
-        if known is None:
+        entry = self._known.get(id(signals))  # kept with its key, so that the id stays its own
+        if entry is None:
             index = np.array([self._index.get(s.target, -1) for s in signals], dtype=np.int64)
-            known = self._known[id(signals)] = (signals, index, np.flatnonzero(index >= 0).tolist())
-        return known
+            entry = self._known[id(signals)] = (signals, index, np.flatnonzero(index >= 0).tolist())
+        return entry
 
 
 class _OffsetTopic:
@@ -184,10 +189,10 @@ class _OffsetTopic:
             return rounds.stamp_ns, []
         stamps_ns, fresh, offsets_s = rounds.stamp_ns.tolist(), list[int](), list[FloatArray]()
         for k, offset_s in enumerate(rounds.offset_s):
-            stamps_ns[k], own = self._place(stamps_ns[k], offset_s)
-            if own is not None:
+            stamps_ns[k], fresh_s = self._place(stamps_ns[k], offset_s)
+            if fresh_s is not None:
                 fresh.append(k)
-                offsets_s.append(own)
+                offsets_s.append(fresh_s)
         placed_ns = np.array(stamps_ns, dtype=np.int64)
         if not fresh:
             return placed_ns, []
@@ -206,8 +211,8 @@ class _OffsetTopic:
     def _place(self, stamp_ns: int, offset_s: FloatArray) -> tuple[int, FloatArray | None]:
         """Return a round's stamp, and its offsets unless they are written."""
         step_ns = -1 if stamp_ns > _STAMPS_KEPT else 1
-        while (known := self._written.get(stamp_ns)) is not None:
-            if known == offset_s.tobytes():
+        while (written := self._written.get(stamp_ns)) is not None:
+            if written == offset_s.tobytes():
                 return stamp_ns, None
             stamp_ns += step_ns
             offset_s = offset_s - step_ns * 1e-9
@@ -274,8 +279,8 @@ class _JointGroup:
         kept = [block for block in blocks.values() if (block[2] >= 0).all()]
         mixed = [block for block in blocks.values() if (block[2] < 0).any()]
         for rows, t_ns, joint, values in mixed:
-            own = joint >= 0
-            kept.append((rows[own], t_ns[own], joint[own], values[own]))
+            present = joint >= 0
+            kept.append((rows[present], t_ns[present], joint[present], values[present]))
         return kept
 
     def _together(self, blocks: Sequence[_Block]) -> _Block:
@@ -287,8 +292,8 @@ class _JointGroup:
         keys, place = np.unique(rows * len(self._joints) + joint, return_inverse=True)
         merged = np.full((len(keys), values.shape[1]), np.nan)
         for column in range(values.shape[1]):
-            known = ~np.isnan(values[:, column])
-            merged[place[known], column] = values[known, column]
+            present = ~np.isnan(values[:, column])
+            merged[place[present], column] = values[present, column]
         merged_t = np.empty(len(keys), dtype=np.int64)
         merged_t[place] = t_ns
         return keys // len(self._joints), merged_t, keys % len(self._joints), merged
@@ -317,8 +322,8 @@ class _JointTopic:
     def messages(self, stamp_ns: IntArray, rounds: Rounds) -> list[TopicMessages]:
         """The messages of the rounds that have anything of this topic."""
         values = rounds.values[:, :, self._columns]
-        known = ~np.isnan(values).all(axis=(1, 2))
-        if not known.any():
+        present = ~np.isnan(values).all(axis=(1, 2))
+        if not present.any():
             return []
         first, rest = self._quantities[0], self._quantities[1:]
         if self._channel is None:
@@ -340,8 +345,8 @@ class _JointTopic:
             )
             channel.write_rows(t_ns, values[:, :, 0], velocity, effort, log_time_ns=log_ns)
 
-        own = stamp_ns[known], values[known]
-        return [TopicMessages(JOINT_TOPIC[first], rounds.last_ns[known], *own, write_rows)]
+        filled = stamp_ns[present], values[present]
+        return [TopicMessages(JOINT_TOPIC[first], rounds.last_ns[present], *filled, write_rows)]
 
 
 def _groups_of(decoder: Decoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
@@ -379,9 +384,9 @@ def _comes_with(
     decoder: Decoder, joints: tuple[str, ...], quantity: Quantity, other: Quantity
 ) -> bool:
     """Return whether every joint that has the quantity has it in the frames of the other one."""
-    own = [(joint, decoder.carriers(joint, quantity)) for joint in joints]
-    return any(carriers for _, carriers in own) and all(
-        not carriers or carriers == decoder.carriers(joint, other) for joint, carriers in own
+    by_joint = [(joint, decoder.carriers(joint, quantity)) for joint in joints]
+    return any(carriers for _, carriers in by_joint) and all(
+        not carriers or carriers == decoder.carriers(joint, other) for joint, carriers in by_joint
     )
 
 
@@ -403,10 +408,10 @@ class _SensorTopic:
             values = row[:, None]
         else:
             t_ns, values = _side_by_side(pieces)
-        known = ~np.isnan(values).all(axis=1)  # a frame of several sensors may be of the others
-        t_ns = t_ns[known]
+        present = ~np.isnan(values).all(axis=1)  # a frame of several sensors may be of the others
+        t_ns = t_ns[present]
         topic, write_rows = self._sensor.topic, self._channel.write_rows
-        return [TopicMessages(topic, t_ns, t_ns, values[known], write_rows)]
+        return [TopicMessages(topic, t_ns, t_ns, values[present], write_rows)]
 
 
 def _side_by_side(pieces: Sequence[_Piece]) -> tuple[IntArray, FloatArray]:

@@ -110,7 +110,7 @@ class RequestMatcher:
             self._staged[servo] = block
         elif instruction == ACTION:
             staged = list(self._staged) if servo == BROADCAST else [servo]
-            return [self._staged.pop(each) for each in staged if each in self._staged] or None
+            return [self._staged.pop(key) for key in staged if key in self._staged] or None
         elif instruction == SYNC_WRITE and len(parameters) > 2 * size:
             at, length = number(parameters, 0), number(parameters, size)
             rows = _rows(parameters[2 * size :], length + 1)
@@ -184,20 +184,20 @@ class RegisterDecoder:
         self._signals = {quantity: tuple(signal) for quantity, signal in signals.items()}
         self._member: dict[Quantity, IntArray] = {}
         self._scales: dict[Quantity, FloatArray] = {}
-        for quantity, own in self._signals.items():
+        for quantity, group in self._signals.items():
             member = np.full(len(joints), -1)
-            motor_of = [joints.index(signal.target) for signal in own]
-            member[motor_of] = np.arange(len(own))
+            motor_of = [joints.index(signal.target) for signal in group]
+            member[motor_of] = np.arange(len(group))
             self._member[quantity] = member
             models = [bus.motors[k].model for k in motor_of]
-            pairs = [self._scale(*pair) for pair in zip(own, models, strict=True)]
+            pairs = [self._scale(*pair) for pair in zip(group, models, strict=True)]
             self._scales[quantity] = np.array(pairs, dtype=np.float64)
         self._layouts: dict[tuple[str, int, int, bool], _Layout] = {}
         self._begun = b""
 
     def _scale(self, signal: BusSignal, model: str) -> tuple[float, float]:
         """Return factor and offset from a raw number to the session's unit."""
-        register = next(one for one in self._maps[model] if one.name == signal.signal)
+        register = next(entry for entry in self._maps[model] if entry.name == signal.signal)
         unit = unit_for(signal.unit, signal.quantity)
         offset = signal.scale * register.offset + signal.offset
         factor = signal.scale * register.scale * unit.factor
@@ -205,9 +205,9 @@ class RegisterDecoder:
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
         """Return a kind of packet for each quantity: which are read together is the driver's."""
-        found = any(signal.target == target for signal in self._signals.get(quantity, ()))
+        carried = any(signal.target == target for signal in self._signals.get(quantity, ()))
         kind = (tuple(Quantity).index(quantity),)
-        return frozenset({(0, (kind,))}) if found else frozenset()
+        return frozenset({(0, (kind,))}) if carried else frozenset()
 
     def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignals, ...], FrameTally]:
         """Decode packets.
@@ -219,10 +219,10 @@ class RegisterDecoder:
         tally = FrameTally(len(frames))
         used: dict[int, _Layout] = {}
         ways = frames["dir"].tolist()
-        known = any(ways)
+        directed = any(ways)
         plain, at = list[int](), 4 if self._wide else 2
         for row, packet in self._packets(frames, tally):
-            blocks = self._matcher.blocks(packet, ways[row] == DIR_TX if known else None)
+            blocks = self._matcher.blocks(packet, ways[row] == DIR_TX if directed else None)
             if not blocks:
                 plain.append(packet[at])
                 continue
@@ -240,7 +240,9 @@ class RegisterDecoder:
             tally.decoded += carries
         self._count(Counter(plain), tally)
         t_ns = frames["t_host_ns"].astype(np.int64)
-        return tuple(one for each in used.values() for one in self._decoded(each, t_ns)), tally
+        return tuple(
+            sample for layout in used.values() for sample in self._decoded(layout, t_ns)
+        ), tally
 
     def _packets(self, frames: FrameArray, tally: FrameTally) -> Iterator[tuple[int, bytes]]:
         """Yield the packets, joined from their records, with the row of the last one."""
@@ -263,22 +265,22 @@ class RegisterDecoder:
     def _count(self, plain: Counter[int], tally: FrameTally) -> None:
         """Count packets without registers, by servo: requests, pings, replies to nothing."""
         for servo, count in plain.items():
-            known = servo == BROADCAST or servo in self._motors
-            counter = tally.silent if known else tally.unknown
+            expected = servo == BROADCAST or servo in self._motors
+            counter = tally.silent if expected else tally.unknown
             counter["all servos" if servo == BROADCAST else f"servo {servo}"] += count
 
     def _layout(self, model: str, address: int, size: int, written: bool) -> _Layout:
         key = (model, address, size, written)
-        found = self._layouts.get(key)
-        if found is None:
+        layout = self._layouts.get(key)
+        if layout is None:
             places = tuple(
-                (at, one)
-                for one in self._maps.get(model, ())
-                if (one.quantity is Quantity.COMMAND) is written
-                and 0 <= (at := one.address - address) <= size - one.size
+                (at, register)
+                for register in self._maps.get(model, ())
+                if (register.quantity is Quantity.COMMAND) is written
+                and 0 <= (at := register.address - address) <= size - register.size
             )
-            found = self._layouts[key] = _Layout(places)
-        return found
+            layout = self._layouts[key] = _Layout(places)
+        return layout
 
     def _decoded(self, layout: _Layout, t_ns: IntArray) -> Iterator[DecodedSignals]:
         row, motor = np.array([sample[:2] for sample in layout.samples], dtype=np.int64).T

@@ -179,10 +179,10 @@ class BusDecoder:
             message = messages[signal.message]
             key = frame_id(message) | (_TX_BIT if signal.direction is Direction.TX else 0)
             self._carried.setdefault(key, []).append((signal, compile_entry(message, signal)))
-        known = {frame_id(message) for message in messages.values()}
+        identifiers = {frame_id(message) for message in messages.values()}
         undirected: set[int] = set()
         if not directions:
-            for identifier in known:
+            for identifier in identifiers:
                 ways = [key for key in (identifier, identifier | _TX_BIT) if key in self._carried]
                 if len(ways) == 1:
                     self._carried[identifier] = self._carried[ways[0]]
@@ -190,13 +190,13 @@ class BusDecoder:
                     undirected.add(identifier)
         self._directions = directions
         self._families, places = _families(self._carried)
-        keys = sorted(known | {identifier | _TX_BIT for identifier in known})
+        keys = sorted(identifiers | {identifier | _TX_BIT for identifier in identifiers})
         self._keys = np.array(keys, dtype=np.int64)
-        found = [
+        pairs = [
             (_UNDIRECTED, 0) if key & ~_TX_BIT in undirected else places.get(key, (_SILENT, 0))
             for key in keys
         ]
-        self._family, self._member = np.array(found, dtype=np.int64).reshape(-1, 2).T
+        self._family, self._member = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
         """Return the kinds of frame that carry a quantity; equal sets mean the same frames.
@@ -263,7 +263,7 @@ def _families(
     for entries, keys in members.items():
         places |= {key: (len(families), k) for k, key in enumerate(keys)}
         signals = [tuple(carried[key][e][0] for key in keys) for e in range(len(entries))]
-        labels = [tuple(f"{each.message}.{each.signal}" for each in row) for row in signals]
+        labels = [tuple(f"{signal.message}.{signal.signal}" for signal in row) for row in signals]
         names = tuple(_name(key) for key in keys)
         families.append(_Family(entries, tuple(signals), tuple(labels), names))
     return families, places

@@ -198,21 +198,23 @@ def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
     frames: list[_Frame] = []
     for selection in selections:
         chosen = dict(selection)
-        own = {s: entry for s, entry in entries.items() if _selected(entry.conditions, chosen)}
-        filled = {signal.signal for signal in own} | {s.multiplexer_signal for s in dbc.values()}
+        selected = {s: entry for s, entry in entries.items() if _selected(entry.conditions, chosen)}
+        filled = {signal.signal for signal in selected} | {
+            s.multiplexer_signal for s in dbc.values()
+        }
         fixed = 0
         for bits, identifier in selection:
             fixed |= bits.placed(identifier, message.length)
-        for each in message.signals:
-            if each.name not in filled and _selected(conditions_of(each, dbc), chosen):
-                fixed |= _initial(each, message.length)
+        for dbc_signal in message.signals:
+            if dbc_signal.name not in filled and _selected(conditions_of(dbc_signal, dbc), chosen):
+                fixed |= _initial(dbc_signal, message.length)
         slots = {
             (signal.target, signal.quantity, signal.axis): _slot(entry, dbc[signal.signal])
-            for signal, entry in own.items()
+            for signal, entry in selected.items()
         }
         default = {
             key: _initial(dbc[signal.signal], message.length)
-            for key, signal in zip(slots, own, strict=True)
+            for key, signal in zip(slots, selected, strict=True)
         }
         for key, slot in slots.items():
             if slot.entry.unknown is not None:

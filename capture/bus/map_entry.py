@@ -279,9 +279,9 @@ def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
 def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
     """Compile one entry."""
     by_name = {signal.name: signal for signal in message.signals}
-    wanted = by_name[signal.signal]
-    bits = BitField.of(wanted)
-    conditions = conditions_of(wanted, by_name)
+    dbc_signal = by_name[signal.signal]
+    bits = BitField.of(dbc_signal)
+    conditions = conditions_of(dbc_signal, by_name)
     return MapEntry(
         quantity=signal.quantity,
         axis=signal.axis,

@@ -97,9 +97,9 @@ class MoteusDecoder:
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
         """Return a kind of frame for each quantity: which come together is the query's."""
-        found = quantity in self._signals and any(motor.joint == target for motor in self._motors)
+        carried = quantity in self._signals and any(motor.joint == target for motor in self._motors)
         kind = (tuple(Quantity).index(quantity),)
-        return frozenset({(0, (kind,))}) if found else frozenset()
+        return frozenset({(0, (kind,))}) if carried else frozenset()
 
     def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignals, ...], FrameTally]:
         """Decode frames, classic or FD, shape (n,)."""
@@ -112,11 +112,11 @@ class MoteusDecoder:
             source, target = identifier >> 8 & 0x7F, identifier & 0x7F
             before = sum(map(len, samples.values()))
             try:
-                found = list(subframes(frames["data"][row, :size].tobytes()))
+                registers = list(subframes(frames["data"][row, :size].tobytes()))
             except ValueError:
                 tally.short[f"moteus {identifier_text(identifier)}"] += 1
                 continue
-            for written, register, number, kind in found:
+            for written, register, number, kind in registers:
                 motor = self._index.get(target if written else source)
                 meaning = _REGISTERS.get(register)
                 if motor is None or meaning is None:
@@ -124,12 +124,12 @@ class MoteusDecoder:
                 quantity, unit, scales = meaning
                 if (quantity is Quantity.COMMAND) is not written:
                     continue
-                own = self._motors[motor]
+                actuator = self._motors[motor]
                 value = number * (scales[kind] if kind < 3 else 1.0)
-                value = float(value) * (own.scale if quantity in _SCALED else 1.0)
+                value = float(value) * (actuator.scale if quantity in _SCALED else 1.0)
                 value *= unit_for(unit, quantity).factor
                 if quantity in _SCALED[:2]:
-                    value += own.offset
+                    value += actuator.offset
                 samples.setdefault(quantity, []).append((row, motor, value))
             if sum(map(len, samples.values())) > before:
                 tally.decoded += 1

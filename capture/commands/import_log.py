@@ -131,11 +131,11 @@ def import_log(
         else:
             by_map = described and column_map if commands is fps is None else None
             if by_map and log.suffix.lower() == ".csv":
-                found = open_mapped(log, by_map)
+                tables = open_mapped(log, by_map)
             else:
-                found = open_tables(log, commands, fps)
+                tables = open_tables(log, commands, fps)
             report = import_tables(
-                found, output, robot=described, column_map=column_map, units=units,
+                tables, output, robot=described, column_map=column_map, units=units,
                 write_map=write_map, force=force, stop=stop,
             )  # fmt: skip
             reports = [report]

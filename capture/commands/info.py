@@ -30,8 +30,8 @@ def info(*, json: bool = False) -> None:
         f"undulog {packages['undulog']} on Python {packages['python']}, {system}",
         "packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"),
     ]
-    for extra, found in extras.items():
-        listed = ", ".join(f"{name} {number}" for name, number in found.items())
+    for extra, versions in extras.items():
+        listed = ", ".join(f"{name} {number}" for name, number in versions.items())
         missing = f"not installed: {install_command(extra)}"
-        lines.append(f"{extra:<9} {missing if None in found.values() else listed}")
+        lines.append(f"{extra:<9} {missing if None in versions.values() else listed}")
     emit({"platform": system, "packages": packages, "extras": extras}, lines, as_json=json)

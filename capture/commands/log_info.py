@@ -243,7 +243,7 @@ def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
     facts = _contract_facts(path, contract)
     verdict = f"{_count(contract)} of" if contract else f"follows all {len(RULES)} rules of"
     head = f"{path.name}: {verdict} the log contract, version {facts['contract']}"
-    emit(facts, [head, *(f"  {one}" for one in contract)], as_json=as_json)
+    emit(facts, [head, *(f"  {violation}" for violation in contract)], as_json=as_json)
     return int(bool(contract))
 
 
@@ -264,12 +264,12 @@ def _count(violations: Sequence[Violation]) -> str:
     return f"{len(violations)} violation{'s' if len(violations) != 1 else ''}"
 
 
-def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
-    violations = [asdict(one) for one in found]
+def _contract_facts(path: Path, contract: Sequence[Violation]) -> dict[str, Any]:
+    violations = [asdict(violation) for violation in contract]
     return {
         "path": str(path),
         "contract": str(CONTRACT_VERSION),
-        "follows": not found,
+        "follows": not contract,
         "violations": violations,
     }
 
@@ -281,9 +281,11 @@ def _check_line(path: Path, topics: JointTopicOptions) -> SessionLine:
     health = check_session(path, topics=topics.names)
     with Session.open(path) as session:
         gait = stated_gait(session.metadata)
-    said = (*health.reasons, *health.notes, "nothing is wrong with it")
+    sentences = (*health.reasons, *health.notes, "nothing is wrong with it")
     good = health.verdict != "bad"
-    return SessionLine(health.robot or "", gait, health.verdict, said[0], as_json(health), good)
+    return SessionLine(
+        health.robot or "", gait, health.verdict, sentences[0], as_json(health), good
+    )
 
 
 def as_json(health: SessionHealth) -> dict[str, Any]:
@@ -382,7 +384,7 @@ def _sequence_lines(health: SessionHealth) -> Iterator[str]:
     for channel in health.channels:
         kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
     counted = [channel for channel in health.channels if channel.sequence.kind == "counted"]
-    dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
+    dropped = math.fsum(channel.sequence.dropped or 0 for channel in counted)
     yield ""
     if counted:
         yield f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels"

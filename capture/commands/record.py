@@ -195,17 +195,17 @@ def status(*, socket: Path | None = None, json: bool = False) -> int:
     """
     from ..recorder.control_client import ControlClient
 
-    found: list[dict[str, Any]] = []
+    recordings: list[dict[str, Any]] = []
     silent: list[str] = []
     for path in [socket] if socket is not None else _running():
         try:
             with ControlClient(path) as recorder:
-                found.append({"socket": str(path), **recorder.ask({"do": "status"})})
+                recordings.append({"socket": str(path), **recorder.ask({"do": "status"})})
         except ControlError as error:
             silent.append(str(error))
     if json:
-        emit_json({"recordings": found, "silent": silent})
-    for recording in [] if json else found:
+        emit_json({"recordings": recordings, "silent": silent})
+    for recording in [] if json else recordings:
         echo(*_summary(recording))
     for error in silent:
         complain(f"error: {error}")

@@ -133,8 +133,8 @@ def robot_show(robot: str, /, *, json: bool = False) -> None:
     """
     from ..robot.description import load_robot
 
-    found = load_robot(robot)
-    emit(_facts(found), _lines(found), as_json=json)
+    description = load_robot(robot)
+    emit(_facts(description), _lines(description), as_json=json)
 
 
 def robot_check(file: Path, /, *, json: bool = False) -> int:
@@ -233,7 +233,7 @@ def _lines(robot: Robot) -> Iterator[str]:
             for text in (
                 joint.name,
                 str(joint.plane),
-                *(f"{one:.4g}" for one in (joint.lower, joint.upper, joint.max_velocity)),
+                *(f"{limit:.4g}" for limit in (joint.lower, joint.upper, joint.max_velocity)),
                 f"{joint.servo.stall_torque:.4g}",
             )
         ]
@@ -250,7 +250,9 @@ def _lines(robot: Robot) -> Iterator[str]:
         yield f"{sensor.name}: {sensor.kind} at {sensor.link}, {sensor.topic}"
     yield from _bus(robot)
     if robot.safety is not None:
-        given = {key: one for key, one in asdict(robot.safety).items() if one not in (None, ())}
+        given = {
+            key: value for key, value in asdict(robot.safety).items() if value not in (None, ())
+        }
         yield f"driving: {', '.join(f'{key} {value}' for key, value in given.items())}"
 
 
@@ -315,11 +317,11 @@ def seen_joints(session: SessionView) -> list[SeenJoint]:
             rate = np.abs(rates.signal(name).values)
         else:
             rate = _rates(angle.t_ns, values[0])
-        known = np.concatenate(values)
-        known, rate = known[np.isfinite(known)], rate[np.isfinite(rate)]
-        if len(known):
+        angles = np.concatenate(values)
+        angles, rate = angles[np.isfinite(angles)], rate[np.isfinite(rate)]
+        if len(angles):
             fastest = float(rate.max(initial=0.0))
-            joints.append(SeenJoint(name, float(known.min()), float(known.max()), fastest))
+            joints.append(SeenJoint(name, float(angles.min()), float(angles.max()), fastest))
     if not joints:
         raise DataError(f"{session.path}: {measured.topic} has no angle of any joint")
     return joints

@@ -56,8 +56,8 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
 
     paths: list[Path] = []
     for path in map(as_path, given):
-        own = _named(path)
-        paths += [one for one in own if one == path or one not in paths]
+        named = _named(path)
+        paths += [session for session in named if session == path or session not in paths]
     return paths
 
 
@@ -76,13 +76,15 @@ def _named(path: Path) -> list[Path]:
     if isinstance(path, RemotePath):
         return [path]
     if path.is_dir():
-        found = _in_folder(path)
-        alone = len(found) == 1 and found[0].parent == path
-        plain = alone and found[0].suffix == ".mcap" and not found[0].is_dir()
-        return [path] if plain or not found else found
+        sessions = _in_folder(path)
+        alone = len(sessions) == 1 and sessions[0].parent == path
+        plain = alone and sessions[0].suffix == ".mcap" and not sessions[0].is_dir()
+        return [path] if plain or not sessions else sessions
     if has_magic(str(path)) and not path.exists():
         matches = sorted(map(Path, glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
-        return list(dict.fromkeys(one for match in matches for one in _matched(match))) or [path]
+        return list(dict.fromkeys(session for match in matches for session in _matched(match))) or [
+            path
+        ]
     return [path]
 
 
@@ -122,17 +124,17 @@ def each(
         Each one's name in the table to its line: its path only where names repeat.
     """
     what = list(dict.fromkeys(what))
-    short = [one.name if isinstance(one, Path) else str(one) for one in what]
-    names = [n if short.count(n) == 1 else str(one) for n, one in zip(short, what, strict=True)]
+    short = [entry.name if isinstance(entry, Path) else str(entry) for entry in what]
+    names = [n if short.count(n) == 1 else str(entry) for n, entry in zip(short, what, strict=True)]
     lines: dict[str, SessionLine] = {}
     with progress(verb, total=len(names)) as bar:
-        for k, (name, one) in enumerate(zip(names, what, strict=True)):
+        for k, (name, session) in enumerate(zip(names, what, strict=True)):
             bar.update(k, note=name)
             try:
-                lines[name] = work(one)
+                lines[name] = work(session)
             except (UndulogError, OSError, MemoryError) as error:
-                why = str(error).removeprefix(f"{one}: ") or "there is not enough memory"
-                facts = {"path": str(one), "error": why}
+                why = str(error).removeprefix(f"{session}: ") or "there is not enough memory"
+                facts = {"path": str(session), "error": why}
                 lines[name] = SessionLine(verdict=FAILED, sentence=why, facts=facts, good=False)
     return lines
 
@@ -161,5 +163,5 @@ def first_sentence(text: str) -> str:
 
 def stated_gait(metadata: Mapping[str, Mapping[str, str]]) -> str:
     """Return what drove a session, as its metadata states it; empty if they don't."""
-    own = metadata.get("undulog", {})
-    return own.get("driven.by") or own.get("scenario") or ""
+    facts = metadata.get("undulog", {})
+    return facts.get("driven.by") or facts.get("scenario") or ""

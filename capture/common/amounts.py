@@ -54,10 +54,10 @@ def parse_size(value: object) -> int:
     Raises:
         DataError: If it is no size; the message describes a valid one.
     """
-    wanted = "a size such as 500MB or 1GiB"
-    match = _AMOUNT.fullmatch(_text(value, wanted))
+    valid = "a size such as 500MB or 1GiB"
+    match = _AMOUNT.fullmatch(_text(value, valid))
     if match is None:
-        raise DataError(wanted)
+        raise DataError(valid)
     return _whole(Fraction(match[1]) * _factor(match[2] or "B", SIZE_UNITS, "size"), "bytes")
 
 
@@ -71,18 +71,18 @@ def parse_duration_ns(value: object) -> int:
     Raises:
         DataError: If it is no duration; the message describes a valid one.
     """
-    wanted = "a duration such as 30s, 10min or 1h30min"
-    text = _text(value, wanted)
+    valid = "a duration such as 30s, 10min or 1h30min"
+    text = _text(value, valid)
     parts = _AMOUNT.findall(text)
     if not parts or "".join(number + unit for number, unit in parts) != text.replace(" ", ""):
-        raise DataError(wanted)
+        raise DataError(valid)
     if len(parts) == 1:
         if _AMOUNT.fullmatch(text) is None:  # more than one space
-            raise DataError(wanted)
+            raise DataError(valid)
         parts = [(parts[0][0], parts[0][1] or "s")]
     factors = [_factor(unit, DURATION_UNITS, "time") for _, unit in parts]
     if any(later >= earlier for earlier, later in pairwise(factors)):
-        raise DataError(f"{wanted}: each unit once, the longest first")
+        raise DataError(f"{valid}: each unit once, the longest first")
     amounts = zip(parts, factors, strict=True)
     total = sum((Fraction(number) * factor for (number, _), factor in amounts), Fraction(0))
     return _whole(total, "nanoseconds")
@@ -101,15 +101,15 @@ def format_size(size: int) -> str:
     return f"{size} B"
 
 
-def _text(value: object, wanted: str) -> str:
+def _text(value: object, valid: str) -> str:
     """Return an amount as a text of limited length."""
     if isinstance(value, int) and not 0 <= value <= LARGEST:  # slow to convert if huge
-        raise DataError(wanted)
+        raise DataError(valid)
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise DataError(wanted)
+        raise DataError(valid)
     text = value.strip() if isinstance(value, str) else repr(value)
     if len(text) > _LONGEST_TEXT:
-        raise DataError(wanted)
+        raise DataError(valid)
     return text
 
 

@@ -116,26 +116,28 @@ def _no_reader(*_: Any) -> Any:
     raise TypeError("this field is read in a way of its own")
 
 
-def read(table: StrictTable, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
+def read(table: StrictTable, cls: type[_Class], **readers: Callable[[], Any]) -> _Class:
     """Read a table as a dataclass declares it; unknown keys are faults.
 
     Args:
         table: The table; faults are noted in its list.
-        own: What gives the value of a field that is read in another way, called in its turn.
+        readers: What gives the value of a field that is read in another way, called in its turn.
 
     Returns:
         The value; of use only if no fault was noted.
     """
-    value = read_fields(table, cls, **own)
+    value = read_fields(table, cls, **readers)
     table.close()
     return value
 
 
-def read_fields(table: StrictTable, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
+def read_fields(table: StrictTable, cls: type[_Class], **readers: Callable[[], Any]) -> _Class:
     """Read the fields of a dataclass from a table that the caller closes, as :func:`read` does."""
     values = {
-        name: own[name]() if name in own else _value(table, one, one.default)
-        for name, one in declared(cls).items()
+        name: readers[name]()
+        if name in readers
+        else _value(table, declaration, declaration.default)
+        for name, declaration in declared(cls).items()
     }
     value = cls(**values)
     for fault in getattr(value, "contradictions", tuple)():
@@ -150,8 +152,8 @@ def read_field(table: StrictTable, cls: type[Any], name: str, default: Any = Non
         table: The table; faults are noted in its list.
         default: In place of the one that the class declares.
     """
-    one = declared(cls)[name]
-    return _value(table, one, one.default if default is None else default)
+    declaration = declared(cls)[name]
+    return _value(table, declaration, declaration.default if default is None else default)
 
 
 def read_required(table: StrictTable, cls: type[Any], name: str) -> Any:
@@ -159,17 +161,19 @@ def read_required(table: StrictTable, cls: type[Any], name: str) -> Any:
     return declared(cls)[name].read(table, None)
 
 
-def _value(table: StrictTable, one: Declared, default: Any) -> Any:
-    if one.optional and default is None and table.look(one.key)[1] is None:
+def _value(table: StrictTable, declaration: Declared, default: Any) -> Any:
+    if declaration.optional and default is None and table.look(declaration.key)[1] is None:
         return None
-    return one.read(table, default)
+    return declaration.read(table, default)
 
 
 def write(value: Any) -> dict[str, Any]:
     """Return the table that gives a dataclass's value when it is read; None is left out."""
     table: dict[str, Any] = {}
-    for name, one in declared(value.__class__).items():
+    for name, declaration in declared(value.__class__).items():
         part = getattr(value, name)
         if part is not None:
-            table[one.key] = write(part) if dataclasses.is_dataclass(cast("object", part)) else part
+            table[declaration.key] = (
+                write(part) if dataclasses.is_dataclass(cast("object", part)) else part
+            )
     return table

@@ -110,12 +110,12 @@ class DescriptionFault:
     """
 
     key: str
-    found: str
+    actual: str
     valid: str
 
     def __str__(self) -> str:
         """Return key, found value and valid values in one line."""
-        return f"{self.key}: found {self.found}; valid: {self.valid}"
+        return f"{self.key}: found {self.actual}; valid: {self.valid}"
 
 
 def _listing(faults: Sequence[DescriptionFault], place: str) -> str:
@@ -204,14 +204,14 @@ class MissingChannelError(LogError, KeyError):
     """A topic, joint or field that the log does not have."""
 
     def __init__(
-        self, path: Path | str, wanted: str, available: Sequence[str], fix: str = ""
+        self, path: Path | str, missing: str, available: Sequence[str], fix: str = ""
     ) -> None:
         """Build the message; ``fix`` is added to it."""
-        self.wanted = wanted
+        self.missing = missing
         self.available = tuple(available)
         listed = some_names(available, _MOST_LISTED) or "nothing"
         advice = f" ({fix})" if fix else ""
-        LogError.__init__(self, path, f"has no {wanted}; it has {listed}{advice}")
+        LogError.__init__(self, path, f"has no {missing}; it has {listed}{advice}")
 
     def __str__(self) -> str:
         """Return the message without the quotes of ``KeyError``."""

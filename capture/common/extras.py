@@ -145,12 +145,12 @@ def extra_packages(extra: str) -> dict[str, str]:
         lines = requires("undulog") or []
     except PackageNotFoundError:
         return {}
-    found: dict[str, str] = {}
-    for wanted in map(Requirement, lines):
-        marker, wanted.marker = wanted.marker, None
+    packages: dict[str, str] = {}
+    for requirement in map(Requirement, lines):
+        marker, requirement.marker = requirement.marker, None
         if marker is not None and marker.evaluate({"extra": extra}):
-            found[wanted.name] = str(wanted)
-    return found
+            packages[requirement.name] = str(requirement)
+    return packages
 
 
 def install_command(extra: str, missing: str = "") -> str:
@@ -179,5 +179,5 @@ def base_versions() -> dict[str, str]:
     """Return the versions of Python and the packages that every result depends on."""
     import platform
 
-    found = {name: package_version(name) for name in _BASE}
-    return {"python": platform.python_version()} | {k: v for k, v in found.items() if v}
+    versions = {name: package_version(name) for name in _BASE}
+    return {"python": platform.python_version()} | {k: v for k, v in versions.items() if v}

@@ -68,12 +68,12 @@ def raised_priority() -> Generator[Priority]:
         return
     raised = min(nice, _NICE)
     priority = Priority(f"refused: {_named(policy, nice)}", refused=True)
-    for wanted, value, name in (
+    for scheduling, value, name in (
         (os.SCHED_RR, nice, "SCHED_RR 1"),
         (os.SCHED_OTHER, raised, f"nice {raised}"),
     ):
         with suppress(PermissionError):
-            _set_all(wanted, value)
+            _set_all(scheduling, value)
             priority = Priority(name)
             break
     try:

@@ -116,11 +116,14 @@ class RemoteFile:
             InputFileError: If they can't be fetched, or the object has changed since it was opened.
         """
         try:
-            found = self._obstore.get(self._store, self._name, options={"range": (start, stop)})
-            data = bytes(found.bytes())
+            response = self._obstore.get(self._store, self._name, options={"range": (start, stop)})
+            data = bytes(response.bytes())
         except Exception as error:  # of the library's own kinds, FileNotFoundError and others
             raise _failed(self.path, error) from error
-        size, tag = found.meta["size"], found.meta["e_tag"] or str(found.meta["last_modified"])
+        size, tag = (
+            response.meta["size"],
+            response.meta["e_tag"] or str(response.meta["last_modified"]),
+        )
         if not self.tag:
             self.size, self.tag = size, tag
         if (size, tag) != (self.size, self.tag):
@@ -138,13 +141,13 @@ class RemoteFile:
             for k, (start, stop) in enumerate(ranges)
             for at in range(start, stop, _PIECE)
         ]
-        found: list[list[bytes]] = [[] for _ in ranges]
+        chunks: list[list[bytes]] = [[] for _ in ranges]
         with ThreadPoolExecutor(max(1, min(_PARALLEL, len(pieces)))) as pool:
             _, starts, stops = zip(*pieces, strict=True) if pieces else ((), (), ())
             fetched = pool.map(self.read, starts, stops)
             for (k, _, _), data in zip(pieces, fetched, strict=True):
-                found[k].append(data)
-        return [b"".join(parts) for parts in found]
+                chunks[k].append(data)
+        return [b"".join(parts) for parts in chunks]
 
 
 class _Stream(io.RawIOBase):

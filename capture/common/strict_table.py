@@ -58,13 +58,13 @@ def _cut(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def listed(words: Iterable[str], found: object = None) -> str:
-    """List the valid words, ``a, b, c``, and ``(did you mean b?)`` if ``found`` is close to one."""
+def listed(words: Iterable[str], actual: object = None) -> str:
+    """List the valid words, ``a, b, c``; ``(did you mean b?)`` if ``actual`` is close to one."""
     valid, near = list(words), list[str]()
-    if isinstance(found, str):
+    if isinstance(actual, str):
         from difflib import get_close_matches
 
-        near = get_close_matches(found, valid, n=1)
+        near = get_close_matches(actual, valid, n=1)
     return (", ".join(valid) or "none") + (f" (did you mean {near[0]}?)" if near else "")
 
 
@@ -115,11 +115,11 @@ class Faults:
         """Whether there are so many that no further one is noted."""
         return len(self._faults) >= _MOST_FAULTS
 
-    def add(self, key: str, found: str, valid: str) -> None:
+    def add(self, key: str, actual: str, valid: str) -> None:
         """Note a fault, long texts cut."""
         if not self.full:
             self._faults[
-                DescriptionFault(*(_cut(text, _LONGEST_TEXT) for text in (key, found, valid)))
+                DescriptionFault(*(_cut(text, _LONGEST_TEXT) for text in (key, actual, valid)))
             ] = None
 
     def all(self) -> tuple[DescriptionFault, ...]:
@@ -169,14 +169,14 @@ class StrictTable:
         """Return the full key, e.g. ``joints[3].plane``."""
         return f"{self._where}.{key}" if self._where else key
 
-    def fault(self, key: str, valid: str, found: str | None = None) -> None:
+    def fault(self, key: str, valid: str, actual: str | None = None) -> None:
         """Note a fault of one key.
 
         Args:
-            found: What stands there; by default the value itself, ``nothing`` when absent.
+            actual: What stands there; by default the value itself, ``nothing`` when absent.
         """
         where, value = self.look(key)
-        self.faults.add(where, found or ("nothing" if value is None else shown(value)), valid)
+        self.faults.add(where, actual or ("nothing" if value is None else shown(value)), valid)
 
     def look(self, key: str) -> tuple[str, object]:
         """Look a key up, first here, then in the defaults.
@@ -203,11 +203,11 @@ class StrictTable:
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
-        found = convert(value)
-        if found is None:
+        result = convert(value)
+        if result is None:
             self.fault(key, valid)
             return substitute
-        return found
+        return result
 
     def text(self, key: str, default: str | None = None) -> str:
         """Return a string; ``""`` after a fault. Without a default it is required."""
@@ -283,8 +283,8 @@ class StrictTable:
         good = all(bound.holds(number) for bound in (*bounds, _USUAL) for number in numbers)
         if good and len(entries) == len(numbers) == count:
             return tuple(numbers)
-        each = "".join(f", each {word}" for word in _limits(bounds, numbers))
-        self.fault(key, f"an array of {count} finite numbers{each}")
+        limits = "".join(f", each {word}" for word in _limits(bounds, numbers))
+        self.fault(key, f"an array of {count} finite numbers{limits}")
         return (math.nan,) * count
 
     def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:

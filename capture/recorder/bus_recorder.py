@@ -74,15 +74,15 @@ def decoded_source(
     Raises:
         UsageError: If there is no such source, or several are possible.
     """
-    own = [source for source in sources if source.robot is None]
+    candidates = [source for source in sources if source.robot is None]
     serial = is_serial(robot.bus if robot is not None else None)
     if robot is not None and robot.bus is not None:
-        fitting = [source for source in own if isinstance(source, SerialSource) is serial]
-        if own and not fitting:
+        fitting = [source for source in candidates if isinstance(source, SerialSource) is serial]
+        if candidates and not fitting:
             kind = "a serial line (serial:PORT?protocol=...)" if serial else "a CAN bus"
             raise UsageError(f"the motors of {robot.name} are on {kind}, and no source is one")
-        own = fitting
-    buses = [source.name for source in own]
+        candidates = fitting
+    buses = [source.name for source in candidates]
     if settings.bus is not None:
         if settings.bus not in buses:
             raise UsageError(f"--bus {settings.bus}: no such bus; there are: {', '.join(buses)}")

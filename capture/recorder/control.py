@@ -302,9 +302,9 @@ class ControlServer:
             self._drop(client)
             return
         listening = client.has_room and not client.ended and not client.closing
-        wanted = selectors.EVENT_READ if listening and len(client.incoming) <= BUFFER else 0
-        wanted |= selectors.EVENT_WRITE if client.outgoing else 0
-        self._watch(client, wanted)
+        events = selectors.EVENT_READ if listening and len(client.incoming) <= BUFFER else 0
+        events |= selectors.EVENT_WRITE if client.outgoing else 0
+        self._watch(client, events)
 
     def _watch(self, client: _Client, events: int) -> None:
         watched = self._selector.get_map().get(client.socket)

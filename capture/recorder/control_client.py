@@ -80,8 +80,8 @@ def find_sockets(environ: Mapping[str, str]) -> list[Path]:
     """Return the control sockets of the running recorders of this user and of services, sorted."""
     folder = socket_folder(environ)
     folders = [folder, _SYSTEM_FOLDER] if _is_own(folder) else [_SYSTEM_FOLDER]
-    found = {path for where in folders for path in _sockets_below(where)}
-    return sorted(path for path in found if _is_in_use(path))
+    sockets = {path for where in folders for path in _sockets_below(where)}
+    return sorted(path for path in sockets if _is_in_use(path))
 
 
 def _is_own(folder: Path) -> bool:
@@ -118,7 +118,7 @@ def listen(
         with _locked(path.parent, patience_s):
             _remove_stale(path)
             listen_at(listener, path, backlog)
-            found = path.lstat()
+            status = path.lstat()
         listener.setblocking(False)
     except OSError as error:
         listener.close()
@@ -126,24 +126,24 @@ def listen(
     except ControlError:
         listener.close()
         raise
-    return listener, (found.st_dev, found.st_ino)
+    return listener, (status.st_dev, status.st_ino)
 
 
 def release(path: Path, listener: socket.socket, identity: Identity) -> None:
     """Close the socket and remove its file, unless that was replaced."""
     with suppress(OSError):  # removed with its folder
-        found = path.lstat()
-        if (found.st_dev, found.st_ino) == identity:
+        status = path.lstat()
+        if (status.st_dev, status.st_ino) == identity:
             path.unlink()
     listener.close()
 
 
 def _remove_stale(path: Path) -> None:
     try:
-        found = path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISSOCK(found.st_mode):
+    if not stat.S_ISSOCK(status.st_mode):
         raise ControlError(f"{path} is there and no socket; name another with --socket")
     if _is_in_use(path):
         raise SocketInUseError(

@@ -225,7 +225,7 @@ def _is_gait_name(name: str) -> bool:
     return _FURTHER.fullmatch(name) is not None
 
 
-def _invalid(key: str, found: object, valid: str) -> ControlError:
-    text = "nothing" if found is None else shown(found)
+def _invalid(key: str, actual: object, valid: str) -> ControlError:
+    text = "nothing" if actual is None else shown(actual)
     text = text if len(text) <= 80 else f"{text[:77]}..."
     return ControlError(f"{key}: found {text}; valid: {valid}")

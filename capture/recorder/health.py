@@ -232,7 +232,7 @@ class LiveHealth:
         timings: dict[str, list[Timing]] = {}
         for series in result.series:
             timings.setdefault(series.topic, []).append(series.timing)
-        found = [
+        snapshots = [
             self._topic(
                 topic,
                 self._measured[key],
@@ -242,7 +242,7 @@ class LiveHealth:
             for key, topic in self._topics.items()
             if key in self._measured
         ]
-        return tuple(sorted(found, key=lambda topic: topic.topic))
+        return tuple(sorted(snapshots, key=lambda topic: topic.topic))
 
     def _topic(
         self,

@@ -364,7 +364,7 @@ class LiveFeed:
 
     def _renew(self, now_ns: int) -> None:
         """Connect to the present relay, perhaps a new one, and queue all definitions for it."""
-        found = self._socket is None
+        fresh = self._socket is None
         if self._socket is None:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
@@ -374,7 +374,7 @@ class LiveFeed:
             self._lose(now_ns)
             return
         self._renew_at_ns = now_ns + RENEW_NS
-        if found:
+        if fresh:
             self.counts.connections += 1
             self._due = dict.fromkeys(self._periods, 0)
         if not self._unsent_definitions:

@@ -192,7 +192,7 @@ class Recorder:
 
     def _start(self) -> None:
         # Last those that listen: connecting may take half a second, and senders don't wait.
-        for source in sorted(self._sources, key=lambda each: isinstance(each, EndingSource)):
+        for source in sorted(self._sources, key=lambda source: isinstance(source, EndingSource)):
             try:
                 source.start(self._context)
             except UndulogError:
@@ -259,8 +259,8 @@ class Recorder:
                 bus.decode(self._clock.now_ns, until_ns, rest=due)
                 self._log_clock_events(name)
         self._each_second.run(now_ns)
-        for each in self._each_tick:
-            each()
+        for work in self._each_tick:
+            work()
 
     def _catch_up(self, pauses: PauseWatch) -> None:
         """Receive what was sent over connections before: the end comes after it.
@@ -439,11 +439,11 @@ class Recorder:
                 self.log_event("error", name, text)
             if not bus.decodes:
                 continue
-            for level, what, found in (
+            for level, what, counts in (
                 ("info", "identifiers that are in no database", bus.tally.unknown),
                 ("warn", "frames too short for", bus.tally.short),
             ):
-                fresh = set(found) - self._reported_ids[name]
+                fresh = set(counts) - self._reported_ids[name]
                 if fresh:
                     self._reported_ids[name] |= fresh
                     listed = ", ".join(sorted(fresh)[:8])

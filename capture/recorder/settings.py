@@ -121,20 +121,20 @@ def _sources(value: object) -> tuple[str, ...]:
 
 def _facts(value: object) -> Mapping[str, str]:
     """Facts of a table, or of ``KEY=VALUE`` words."""
-    wanted = "names with strings, e.g. place=tank; a name has letters, digits, _, - and ."
+    valid = "names with strings, e.g. place=tank; a name has letters, digits, _, - and ."
     if isinstance(value, Mapping):
         facts = dict(cast("Mapping[object, object]", value))
     else:
         words = _words(value)
         if not all("=" in word for word in words):
-            raise DataError(wanted)
+            raise DataError(valid)
         pairs = [word.split("=", 1) for word in words]
         facts = dict(cast("list[tuple[object, object]]", pairs))
         if len(facts) != len(pairs):
             raise DataError("each name once")
     for name, text in facts.items():
         if not (isinstance(name, str) and _FACT.fullmatch(name) and isinstance(text, str)):
-            raise DataError(wanted)
+            raise DataError(valid)
     return MappingProxyType(cast("dict[str, str]", facts))
 
 
@@ -210,10 +210,14 @@ class RecordSettings:
     origin: Mapping[str, str] = field(default_factory=dict[str, str], compare=False)
 
 
-_FIELDS = {each.name.removesuffix("_s"): each for each in fields(RecordSettings) if each.metadata}
+_FIELDS = {
+    setting.name.removesuffix("_s"): setting
+    for setting in fields(RecordSettings)
+    if setting.metadata
+}
 
 PARSERS: Mapping[str, Callable[[object], Any]] = MappingProxyType(
-    {name: each.metadata["parse"] for name, each in _FIELDS.items()}
+    {name: setting.metadata["parse"] for name, setting in _FIELDS.items()}
 )
 """Name of a setting to the parser of its value."""
 
@@ -268,8 +272,8 @@ def resolve(
                 given[name] = layer, raw
                 values[_FIELDS[name].name] = value
     _check_together(given, faults)
-    if found := faults.all():
-        raise SettingsError(found)
+    if noted := faults.all():
+        raise SettingsError(noted)
     origin = {name: given[name][0].origin if name in given else "default" for name in PARSERS}
     if file is not None and origin["robot"] == _origin(file):
         values["robot"] = _robot_file(file, values["robot"])
@@ -291,15 +295,17 @@ def _environment(environ: Mapping[str, str], faults: Faults) -> _Layer:
     def spell(name: str) -> str:
         return f"{ENVIRONMENT_PREFIX}{name.upper()}"
 
-    known = {spell(name): name for name in PARSERS}
+    variables = {spell(name): name for name in PARSERS}
     values: dict[str, object] = {}
     for variable, text in environ.items():
         if not variable.startswith(ENVIRONMENT_PREFIX) or variable == FILE_VARIABLE:
             continue
-        if variable in known:
-            values[known[variable]] = text
+        if variable in variables:
+            values[variables[variable]] = text
         else:
-            faults.add(variable, "an unknown variable", listed([*known, FILE_VARIABLE], variable))
+            faults.add(
+                variable, "an unknown variable", listed([*variables, FILE_VARIABLE], variable)
+            )
     return _Layer("environment", values, spell)
 
 

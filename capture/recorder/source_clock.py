@@ -326,12 +326,12 @@ class SourceClock:
     def result(self) -> ClockEstimate:
         """Return the present estimate."""
         self._count_delays()
-        line, known = self._envelope.line, self._own and self._envelope.settled
+        line, settled = self._envelope.line, self._own and self._envelope.settled
         offset = drift = unsure = None
         if self._own:
             x = self._device - self._origin[0]
             offset = self._origin[1] + round(line.offset_ns + line.rate * x)
-        if known:
+        if settled:
             drift, unsure = (1.0 / (1.0 + line.rate) - 1.0) * 1e6, line.uncertainty * 1e6
         count = max(self._samples, 1)
         mean = self._moments[0] / count
@@ -376,8 +376,8 @@ class SourceClock:
         parts: list[IntArray] = []
         starts: list[int] = [0, *cuts.tolist()]
         for start, stop in itertools.pairwise([*starts, len(host)]):
-            one, other = device[start:stop], host[start:stop]
-            parts.append(self._in_order(other) if without[start] else self._map(one, other))
+            stamped, other = device[start:stop], host[start:stop]
+            parts.append(self._in_order(other) if without[start] else self._map(stamped, other))
         return np.concatenate(parts)
 
     def _map(self, device: IntArray, host: IntArray) -> IntArray:
@@ -458,7 +458,7 @@ class SourceClock:
 
     def _place(self, device: IntArray, host: IntArray) -> IntArray:
         """Map samples by the line, in the device's order and not after their arrival."""
-        line, own = self._envelope.line, device
+        line, sampled = self._envelope.line, device
         device = np.maximum(np.maximum.accumulate(device), self._front)
         x = device - self._origin[0]
         lag = np.floor(line.offset_ns + line.rate * x).astype(np.int64)
@@ -469,7 +469,7 @@ class SourceClock:
         mapped = np.maximum(np.maximum.accumulate(mapped), self._last)
         self._last, self._front = int(mapped[-1]), int(device[-1])
         self._floor = self._last - int(half[-1])
-        return mapped - (device - own)
+        return mapped - (device - sampled)
 
     def _count_delays(self) -> None:
         if not self._delays:

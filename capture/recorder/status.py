@@ -107,10 +107,10 @@ class TickTally:
 
     def _point(self, part: float) -> float:
         """Return the upper edge of the bin of a quantile [s]."""
-        wanted, seen = part * self._count, 0
+        rank, seen = part * self._count, 0
         for edge, number in zip((*_EDGES_NS, self._longest_ns), self._bins, strict=True):
             seen += number
-            if number and seen >= wanted:
+            if number and seen >= rank:
                 return min(edge, self._longest_ns) * 1e-9
         return 0.0
 
@@ -272,11 +272,11 @@ def group_of(topic: str) -> str:
 def combined(name: str, topics: Sequence[TopicSnapshot]) -> TopicSnapshot:
     """Combine topics into one: sums of the counts and rates, the worst of the other values."""
 
-    def known(key: str) -> list[Any]:
+    def values(key: str) -> list[Any]:
         return [value for topic in topics if (value := getattr(topic, key)) is not None]
 
     def total(key: str) -> int | None:
-        return sum(known(key)) if known(key) else None
+        return sum(values(key)) if values(key) else None
 
     def joints(key: str) -> tuple[str, ...]:
         return tuple(sorted({joint for topic in topics for joint in getattr(topic, key)}))
@@ -284,11 +284,11 @@ def combined(name: str, topics: Sequence[TopicSnapshot]) -> TopicSnapshot:
     return TopicSnapshot(
         topic=name,
         count=sum(topic.count for topic in topics),
-        rate_hz=math.fsum(known("rate_hz")) if known("rate_hz") else None,
+        rate_hz=math.fsum(values("rate_hz")) if values("rate_hz") else None,
         age_s=max(topic.age_s for topic in topics),
         gaps=total("gaps"),
         missing=total("missing"),
-        jitter=max(known("jitter"), default=None),
+        jitter=max(values("jitter"), default=None),
         dropped=total("dropped"),
         at_limit=joints("at_limit"),
         frozen=joints("frozen"),

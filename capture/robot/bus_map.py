@@ -132,12 +132,12 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
     for name, text in databases.items():
         where = f"bus.databases: {name}"
         try:
-            found = _messages(text)
+            parsed = _messages(text)
         except UnsupportedDatabaseFormatError as error:
             faults.add(where, str(error.e_dbc), "a DBC without overlaps")
             readable = False
             continue
-        for message in found:
+        for message in parsed:
             for signal in message.signals:
                 if None in map(finite_number, (signal.scale, signal.offset)):
                     why = f"{message.name}.{signal.name} is scaled by a number that is not finite"
@@ -263,11 +263,11 @@ def _signal(
     joints: tuple[Joint, ...],
     sensors: tuple[Sensor, ...],
 ) -> BusSignal:
-    message, known = _message(entry, messages)
+    message, signals = _message(entry, messages)
     signal = entry.text("signal")
-    dbc = (known or {}).get(signal)
-    if known is not None and signal and dbc is None:
-        entry.fault("signal", f"a signal of {message}: {listed(known, signal)}")
+    dbc = (signals or {}).get(signal)
+    if signals is not None and signal and dbc is None:
+        entry.fault("signal", f"a signal of {message}: {listed(signals, signal)}")
     direction = entry.choice("direction", Direction) or Direction.RX
     target, quantity = entry.text("target"), entry.choice("quantity", Quantity)
     unit = entry.text("unit")

@@ -146,10 +146,10 @@ def _read_safety(top: StrictTable, joints: tuple[Joint, ...]) -> Safety | None:
     singles = top.table("safety_of")
     of: list[tuple[str, str, float]] = []
     for joint in joints:
-        own = singles.table(joint.name)
-        given = ((limit, read_field(own, Safety, limit)) for limit in JOINT_LIMITS)
+        limits = singles.table(joint.name)
+        given = ((limit, read_field(limits, Safety, limit)) for limit in JOINT_LIMITS)
         of += [(joint.name, limit, value) for limit, value in given if value is not None]
-        own.close()
+        limits.close()
     singles.close()
     return replace(safety, of=tuple(of))
 
@@ -190,13 +190,13 @@ def _sensor(table: StrictTable, kind: SensorKind, link_names: list[str]) -> Sens
         return lambda: read_required(table, Sensor, name) if name in ranges else None
 
     def axes() -> tuple[str, ...]:
-        found = table.words("axes", valid=("x", "y", "z")) if not ranges else ()
-        if not ranges and not found:
+        measured = table.words("axes", valid=("x", "y", "z")) if not ranges else ()
+        if not ranges and not measured:
             table.fault("axes", 'an array of the measured axes, e.g. ["x", "y"]')
-        return found
+        return measured
 
-    own = {name: given(name) for name in _RANGE_FIELDS}
-    sensor = read_fields(table, Sensor, link=link, axes=axes, assumed=tuple, **own)
+    readers = {name: given(name) for name in _RANGE_FIELDS}
+    sensor = read_fields(table, Sensor, link=link, axes=axes, assumed=tuple, **readers)
     sensor = replace(sensor, assumed=table.words("assumed", valid=fields))
     table.close()
     return sensor
@@ -219,12 +219,12 @@ def load_robot(name_or_path: str | Path) -> Robot:
         InputFileError: If it is a path, and the file isn't there or can't be read.
         RobotFileError: If the description has faults; lists all of them.
     """
-    found = _SHELF.read(name_or_path)
+    file = _SHELF.read(name_or_path)
     return _parse(
-        found.text,
-        found.source,
-        lambda name: _decoded(found.folder / name),
-        lambda name: _bytes(found.folder / name),
+        file.text,
+        file.source,
+        lambda name: _decoded(file.folder / name),
+        lambda name: _bytes(file.folder / name),
     )
 
 
@@ -347,8 +347,8 @@ def _parse(
     meshes = () if read_mesh is None else read_meshes(links, faults, read_mesh)
     defaults.close()
     top.close()
-    if found := faults.all():
-        raise RobotFileError(source, found)
+    if noted := faults.all():
+        raise RobotFileError(source, noted)
     return Robot(
         name=name,
         description=description,

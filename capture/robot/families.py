@@ -107,15 +107,15 @@ def dbc_text(frames: Mapping[str, Frame]) -> str:
         lines += ["", f"BO_ {number} {name}: {frame.size} Vector__XXX"]
         if frame.multiplexer:
             lines.append(f' SG_ selector M : {frame.multiplexer} (1,0) [0|0] "" Vector__XXX')
-        for one in frame.fields:
-            mark = f" m{one.selector[0]}" if one.selector else ""
-            scaled = f"({one.scale!r},{one.offset!r})"
-            lines.append(f' SG_ {one.name}{mark} : {one.bits} {scaled} [0|0] "" Vector__XXX')
-            if one.is_float:
-                extra.append(f"SIG_VALTYPE_ {number} {one.name} : 1;")
-            if len(one.selector) > 1:
-                ranges = ", ".join(f"{value}-{value}" for value in one.selector)
-                extra.append(f"SG_MUL_VAL_ {number} {one.name} selector {ranges};")
+        for part in frame.fields:
+            mark = f" m{part.selector[0]}" if part.selector else ""
+            scaled = f"({part.scale!r},{part.offset!r})"
+            lines.append(f' SG_ {part.name}{mark} : {part.bits} {scaled} [0|0] "" Vector__XXX')
+            if part.is_float:
+                extra.append(f"SIG_VALTYPE_ {number} {part.name} : 1;")
+            if len(part.selector) > 1:
+                ranges = ", ".join(f"{value}-{value}" for value in part.selector)
+                extra.append(f"SG_MUL_VAL_ {number} {part.name} selector {ranges};")
     return "\n".join([*lines, "", *extra, ""])
 
 
@@ -153,10 +153,10 @@ def _mit_reply(
     id_: int, motor: int, most: tuple[float, float, float], *, low_nibble: bool, warmth: float
 ) -> Frame:
     """Motor number, position 16, velocity 12, torque 12 bits, temperature."""
-    own = (motor,)
+    selector = (motor,)
     fields = (
-        *_state(("15|16@0+", "31|12@0+", "35|12@0+"), most, own),
-        SignalField("temperature", "48|8@1+", Quantity.TEMPERATURE, "degC", 1.0, warmth, own),
+        *_state(("15|16@0+", "31|12@0+", "35|12@0+"), most, selector),
+        SignalField("temperature", "48|8@1+", Quantity.TEMPERATURE, "degC", 1.0, warmth, selector),
     )
     return Frame("reply", RX, id_, fields, "0|4@1+" if low_nibble else "0|8@1+")
 
@@ -316,11 +316,11 @@ def read_family(
     if family not in names:
         table.fault("family", listed(names, family))
     motors = _motors(table, joints, models_of(family))
-    for what, found in (("id", [m.id for m in motors]), ("joint", [m.joint for m in motors])):
-        if len(set(found)) < len(found):
-            table.fault("motors", f"every {what} once", f"one of {found} is repeated")
-    own = CAN_FAMILIES[family].bitrate if family in CAN_FAMILIES else _DEFAULT_BITRATE
-    bitrate = table.integer("bitrate", 1, default=own)
+    for what, values in (("id", [m.id for m in motors]), ("joint", [m.joint for m in motors])):
+        if len(set(values)) < len(values):
+            table.fault("motors", f"every {what} once", f"one of {values} is repeated")
+    usual = CAN_FAMILIES[family].bitrate if family in CAN_FAMILIES else _DEFAULT_BITRATE
+    bitrate = table.integer("bitrate", 1, default=usual)
     table.close()
     if table.faults.all():
         return Bus((), bitrate, (), family=family), ()
@@ -348,7 +348,9 @@ def _motors(
         if not all(number >= 0 and number.is_integer() for number in ids):
             table.fault("ids", f"{len(joints)} whole numbers, at least 0")
             return ()
-        return tuple(Motor(name, int(one), usual) for name, one in zip(names, ids, strict=False))
+        return tuple(
+            Motor(name, int(number), usual) for name, number in zip(names, ids, strict=False)
+        )
     motors: list[Motor] = []
     for entry in table.tables("motors"):
         base = entry.over(entry.replaced({"model": usual})) if models else entry
@@ -377,9 +379,9 @@ def _signals(
             message = f"{motor.joint}_{frame.name}"
             frames[message] = frame
             rows += [
-                (message, one.name, frame.direction, one.quantity, one.unit, one.unknown)
-                for one in frame.fields
-                if one.quantity is not None
+                (message, part.name, frame.direction, part.quantity, part.unit, part.unknown)
+                for part in frame.fields
+                if part.quantity is not None
             ]
         for message, name, way, quantity, unit, unknown in rows:
             scale = motor.scale if quantity in _SCALED else 1.0
@@ -403,7 +405,7 @@ def _one_an_identifier(frames: dict[str, Frame], signals: list[BusSignal]) -> di
         if host == name:
             joined[name] = frame
             continue
-        renamed = tuple(replace(one, name=f"{name}_{one.name}") for one in frame.fields)
+        renamed = tuple(replace(part, name=f"{name}_{part.name}") for part in frame.fields)
         joined[host] = replace(joined[host], fields=(*joined[host].fields, *renamed))
         for k, signal in enumerate(signals):
             if signal.message == name:

@@ -84,9 +84,9 @@ class Safety:
             Shape (m,); NaN where there is none.
         """
         common: float | None = getattr(self, limit)
-        own = {joint: value for joint, name, value in self.of if name == limit}
+        by_joint = {joint: value for joint, name, value in self.of if name == limit}
         fallback = math.nan if common is None else common
-        return frozen(np.array([own.get(name, fallback) for name in joint_names]))
+        return frozen(np.array([by_joint.get(name, fallback) for name in joint_names]))
 
 
 class Seat(StrEnum):

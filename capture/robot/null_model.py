@@ -182,8 +182,8 @@ def read_null_model(path: Path) -> NullModel:
         top.fault("modules", "at least one kind of deviation, e.g. stall_torque")
     gait.close()
     top.close()
-    if found := faults.all():
-        raise NullModelError(path, found)
+    if noted := faults.all():
+        raise NullModelError(path, noted)
     return model
 
 
@@ -237,4 +237,4 @@ def _fits(value: object, shape: tuple[int, ...], flat: list[float]) -> bool:
         return math.isfinite(flat[-1])
     if not isinstance(value, list) or len(cast("list[object]", value)) != shape[0]:
         return False
-    return all(_fits(one, shape[1:], flat) for one in cast("list[object]", value))
+    return all(_fits(part, shape[1:], flat) for part in cast("list[object]", value))

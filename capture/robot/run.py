@@ -113,7 +113,7 @@ def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> TwinRun | None
     """Read the attached scenario of a session without the record; None if it is unreadable."""
     try:
         scenario = read_toml(text.decode())
-        world, each = _table(scenario, "world"), _table(scenario, "servo_of")
+        world, servos = _table(scenario, "world"), _table(scenario, "servo_of")
         ground, links = _table(world, "ground"), _table(scenario, "link_of")
         return TwinRun(
             physics_rate_hz=float(scenario.get("physics_rate_hz", 1000)),
@@ -121,7 +121,7 @@ def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> TwinRun | None
             contact=world.get("surface", "flat") != "none" or bool(world.get("obstacles")),
             drag_ratio=drag_ratio(ground.get("mu_normal", 0), ground.get("mu_tangential", 0)),
             servo_of={
-                joint: _numbers(_table(scenario, "servo") | _table(each, joint))
+                joint: _numbers(_table(scenario, "servo") | _table(servos, joint))
                 for joint in joint_names
             },
             mass_factor={name: _table(links, name).get("mass_factor", 1.0) for name in links},
@@ -141,5 +141,5 @@ def _numbers(servo: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _table(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    found = values.get(name, {})
-    return cast("dict[str, Any]", found) if isinstance(found, dict) else {}
+    table = values.get(name, {})
+    return cast("dict[str, Any]", table) if isinstance(table, dict) else {}

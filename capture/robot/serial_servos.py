@@ -176,8 +176,8 @@ def _judge_feetech(data: bytes, at: int, ended: bool) -> int:
     return _feetech(data, at, ended, {})
 
 
-def _feetech(data: bytes, at: int, ended: bool, known: dict[int, int]) -> int:  # noqa: PLR0911
-    """Judge a packet; ``known`` keeps the judgements of those inside, by where they begin."""
+def _feetech(data: bytes, at: int, ended: bool, judged: dict[int, int]) -> int:  # noqa: PLR0911
+    """Judge a packet; ``judged`` keeps the judgements of those inside, by where they begin."""
     end = len(data)
     if at + 4 > end:
         return FAULTY if data[at + 2 : at + 3] == b"\xff" else MORE
@@ -192,9 +192,9 @@ def _feetech(data: bytes, at: int, ended: bool, known: dict[int, int]) -> int:  
     # One in 256 packets that were cut passes with bytes of the next one: that has its own checksum.
     inside = data.find(b"\xff\xff", at + 4, stop)
     while inside >= 0:
-        other = known.get(inside)
-        if other is None:  # packets in packets: without `known` the time doubles with each
-            other = known[inside] = _feetech(data, inside, ended, known)
+        other = judged.get(inside)
+        if other is None:  # packets in packets: without `judged` the time doubles with each
+            other = judged[inside] = _feetech(data, inside, ended, judged)
         if other == MORE and not ended:
             return MORE
         if other > 0 and inside + other >= stop:
@@ -269,23 +269,23 @@ class PacketSplitter:
         header, judge = self._protocol.header, self._protocol.judge
         pieces: list[StreamPiece] = []
         start = at = 0  # of what is not handed out yet, of the search
-        while (found := data.find(header, at)) >= 0:
-            size = judge(data, found, silence)
+        while (begin := data.find(header, at)) >= 0:
+            size = judge(data, begin, silence)
             if size == MORE and not silence:
                 break
             if size <= 0:
-                at = found + 1
+                at = begin + 1
                 continue
-            if found > start:
-                pieces.append(StreamPiece(data[start:found], self._done + found, False))
-            start = at = found + size
-            pieces.append(StreamPiece(data[found:start], self._done + start, True))
-        if found < 0:
-            found = len(data) if silence else _header_begins(data, at, header)
-        if found > start:
-            pieces.append(StreamPiece(data[start:found], self._done + found, False))
-        self._done += max(found, start)
-        self._rest = data[max(found, start) :]
+            if begin > start:
+                pieces.append(StreamPiece(data[start:begin], self._done + begin, False))
+            start = at = begin + size
+            pieces.append(StreamPiece(data[begin:start], self._done + start, True))
+        if begin < 0:
+            begin = len(data) if silence else _header_begins(data, at, header)
+        if begin > start:
+            pieces.append(StreamPiece(data[start:begin], self._done + begin, False))
+        self._done += max(begin, start)
+        self._rest = data[max(begin, start) :]
         return pieces
 
 

@@ -296,10 +296,10 @@ def open_can(address: SourceAddress) -> Source:
 def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
     """Make the source of an interface that python-can reads."""
     bus = bus_class(address.text, interface)
-    own = ("listen_only", "device_time")
-    given = {key: value for key, value in address.options.items() if key not in own}
+    handled = ("listen_only", "device_time")
+    given = {key: value for key, value in address.options.items() if key not in handled}
     if bus.__module__.startswith("can."):  # others' classes may take what they don't name
-        only(address, {*own, *known_options(bus)})
+        only(address, {*handled, *known_options(bus)})
     offered = interface in LISTEN_ONLY
     listen_only = flag(address, "listen_only", default=offered)
     if listen_only and not offered:

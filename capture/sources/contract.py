@@ -355,11 +355,11 @@ def open_source(address: SourceAddress) -> Source:
         MissingExtraError: If the scheme needs an extra that is not installed.
         SourceError: If it can never work here, or its plug-in fails.
     """
-    found = entry_points(group=ENTRY_POINTS, name=address.scheme)
-    if not found:
+    plugins = entry_points(group=ENTRY_POINTS, name=address.scheme)
+    if not plugins:
         valid = listed(schemes(), address.scheme)
         raise UsageError(f"{address.text!r}: no kind of source {address.scheme!r}; valid: {valid}")
-    return _open(next(iter(found)), address)
+    return _open(next(iter(plugins)), address)
 
 
 def open_sources(texts: Iterable[str]) -> list[Source]:

@@ -285,16 +285,16 @@ def holders(path: str | Path) -> list[str]:
 
     Those of other users can't be seen.
     """
-    found: list[str] = []
-    wanted = Path(path).resolve()
+    processes: list[str] = []
+    device = Path(path).resolve()
     for process in Path("/proc").glob("[0-9]*"):
         if int(process.name) == os.getpid():
             continue
         with suppress(OSError):
-            if wanted in {link.readlink() for link in (process / "fd").iterdir()}:
+            if device in {link.readlink() for link in (process / "fd").iterdir()}:
                 name = (process / "comm").read_text().strip()
-                found.append(f"{name} ({process.name})")
-    return sorted(found)
+                processes.append(f"{name} ({process.name})")
+    return sorted(processes)
 
 
 def open_exclusively(path: str, baud: int, *, write: bool = False) -> int:

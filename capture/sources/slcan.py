@@ -97,11 +97,11 @@ class SlcanText:
         if len(self._rest) > _LONGEST:
             self._rest = b"?"  # noise: its end, when it comes, is one malformed line
         text = whole[:end].decode("latin-1")  # any byte is some character
-        found: list[tuple[str, str, str]] = _FRAMES.findall(text)
-        if len(found) != text.count("\r") or "\a" in text:
-            found = _line_by_line(text, tally)
-        packed = [record for fields in found if (record := self._record(*fields, t_ns))]
-        tally.malformed("malformed line", len(found) - len(packed))
+        matches: list[tuple[str, str, str]] = _FRAMES.findall(text)
+        if len(matches) != text.count("\r") or "\a" in text:
+            matches = _line_by_line(text, tally)
+        packed = [record for fields in matches if (record := self._record(*fields, t_ns))]
+        tally.malformed("malformed line", len(matches) - len(packed))
         if not self._has_fd:  # the usual case: nothing to pick
             return records(packed), empty_fd_frames(0)
         size = wire.FRAME_DTYPE.itemsize
@@ -174,16 +174,16 @@ class AdapterClock:
 def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
     """Return the fields of the frames in a chunk that has other lines too."""
     tally.malformed("the adapter reports an error (bell)", text.count("\a"))
-    found: list[tuple[str, str, str]] = []
+    matches: list[tuple[str, str, str]] = []
     malformed = 0
     for line in _END.split(text):
         frame = _ONE.fullmatch(line)
         if frame is not None:
-            found.append((frame[1], frame[2], frame[3]))
+            matches.append((frame[1], frame[2], frame[3]))
         elif line and line[0] not in _ANSWERS:
             malformed += 1
     tally.malformed("malformed line", malformed)
-    return found
+    return matches
 
 
 @dataclass(frozen=True)

@@ -81,10 +81,10 @@ class SocketcandText:
         if len(self._rest) > _LONGEST:
             self._rest = b"<"  # noise: its end, when it comes, is one malformed message
         text = whole[:end].decode("latin-1")  # any byte is some character
-        found: list[tuple[str, str, str, str]] = _FRAMES.findall(text)
+        matches: list[tuple[str, str, str, str]] = _FRAMES.findall(text)
         packed = None
-        if len(found) == text.count("<") == text.count(">"):
-            packed = _together(found)
+        if len(matches) == text.count("<") == text.count(">"):
+            packed = _together(matches)
         if packed is not None:
             frames = records(packed)
             counts = [piece.count(b">") for piece in pieces]
@@ -94,10 +94,10 @@ class SocketcandText:
         return records(_one_by_one(text, stops, times_ns, tally))
 
 
-def _together(found: list[tuple[str, str, str, str]]) -> list[bytes] | None:
+def _together(matches: list[tuple[str, str, str, str]]) -> list[bytes] | None:
     """Records from their fields; None if an identifier is too high for its number of digits."""
     packed: list[bytes] = []
-    for digits, seconds, micros, field in found:
+    for digits, seconds, micros, field in matches:
         flags = int(digits, 16)
         if len(digits) > 3:
             if flags > ID_MASK:
@@ -196,9 +196,9 @@ class SocketcandLink:
             pieces += [
                 row[:size].tobytes() for row, size in zip(batch.packets, batch.sizes, strict=True)
             ]
-            found = self._clock.times(batch.stamps_ns, self._floor_ns)
-            self._floor_ns = found[-1]
-            times_ns += found
+            stamps_ns = self._clock.times(batch.stamps_ns, self._floor_ns)
+            self._floor_ns = stamps_ns[-1]
+            times_ns += stamps_ns
         if pieces:
             return (self._text.feed_pieces(pieces, times_ns, self._tally),)
         if not pending:  # after a stop of this process, pieces may wait for long

@@ -239,7 +239,7 @@ class UnixSource:
         self._senders.append(sender)
         stay = [sender for sender in self._senders if not sender.leaves]
         if len(stay) > MOST_SENDERS:
-            longest = min(stay, key=lambda each: (each.active, each.last_ns))
+            longest = min(stay, key=lambda sender: (sender.active, sender.last_ns))
             text = f"more than {MOST_SENDERS} senders: the one silent for longest is disconnected"
             self._tally.events.log_event("warn", text)
             longest.leaves = True

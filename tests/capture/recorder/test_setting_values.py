@@ -95,7 +95,7 @@ def test_amounts_have_a_least_value(name, least, below, valid):
 def faults_of(cli, environ=None, file=None):
     with pytest.raises(SettingsError) as caught:
         resolve(cli, environ or {}, file)
-    return [(fault.key, fault.found, fault.valid) for fault in caught.value.faults]
+    return [(fault.key, fault.actual, fault.valid) for fault in caught.value.faults]
 
 
 def test_what_is_missing_is_said_and_what_a_ring_excludes():
