@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from .scenario.sensors import AccelerometerModel as AccelerometerModel
     from .scenario.sensors import CompassModel as CompassModel
     from .scenario.sensors import InfraredModel as InfraredModel
+    from .scenario.sensors import Noise as Noise
     from .scenario.sensors import SensorModels as SensorModels
-    from .scenario.sensors import SensorNoise as Noise
     from .scenario.sensors import ServoPolling as ServoPolling
     from .scenario.sensors import SonarModel as SonarModel
     from .scenario.world import FrictionLaw as FrictionLaw

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.estimators.spectrum import Noise, residual_spectrum
+from undulog.analysis.estimators.spectrum import FundamentalNoise, residual_spectrum
 from undulog.analysis.response.response import respond
 from undulog.analysis.segments.profile import scatter_of
 
@@ -117,7 +117,7 @@ def judged(shared, correlation, *, runs=300, **more):
             asked.fundamental,
             exact,
             fit.fundamental[own],
-            Noise(noise.level[own], noise.dof[own], noise.covariance[own]),
+            FundamentalNoise(noise.level[own], noise.dof[own], noise.covariance[own]),
             bins=(exact_bins, bins.select(own)),
         )
         values = weights @ np.log(found.gain), weights @ found.lag_rad

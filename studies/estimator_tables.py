@@ -15,7 +15,7 @@ from scipy.signal import correlate, correlation_lags, hilbert, lfilter
 from undulog.analysis.estimators.harmonic import fit_at, fit_shared
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.estimators.spectrum import Noise, residual_noise, residual_spectrum
+from undulog.analysis.estimators.spectrum import FundamentalNoise, residual_noise, residual_spectrum
 from undulog.analysis.response.response import respond
 
 GAIN, LAG = 0.9, 0.2
@@ -97,7 +97,10 @@ def fitted(t, command, own, responses, guess):
 
 def responded(fit, noise, commands, answers):
     """Return responses, and half widths of the 95 % intervals of lag and log gain, (2, draws)."""
-    part = [Noise(noise.level[k], noise.dof[k], noise.covariance[k]) for k in (commands, answers)]
+    part = [
+        FundamentalNoise(noise.level[k], noise.dof[k], noise.covariance[k])
+        for k in (commands, answers)
+    ]
     found = respond(fit.fundamental[commands], part[0], fit.fundamental[answers], part[1])
     factor = np.array([t_factor(dof) for dof in found.dof])
     return found, factor * np.sqrt([found.lag_variance, found.log_gain_variance])
@@ -210,7 +213,7 @@ def rounded(
     noise, bins = residual_spectrum(series, fit)
     level = np.mean(np.abs(bins.values) ** 2, axis=1)
     dof = np.full(level.size, 2.0 * bins.offset.size)
-    alone = Noise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
+    alone = FundamentalNoise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
     covered = []
     for one in (alone, noise):
         found, half = responded(fit, one, slice(draws), slice(draws, None))

@@ -54,7 +54,7 @@ KEPT_POWER = 0.5
 
 
 @dataclass(frozen=True)
-class Noise:
+class FundamentalNoise:
     """Noise of the fitted fundamental of K channels.
 
     Attributes:
@@ -131,7 +131,7 @@ class ResidualBins:
         return ResidualBins(self.values[index], self.offset, *chosen_rows)
 
 
-def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
+def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> FundamentalNoise:
     """Return the noise of each channel's fundamental.
 
     The periodogram is a direct sum over the actual sampling times, so it needs no even grid. Each
@@ -148,7 +148,9 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
     return residual_spectrum(series, fit)[0]
 
 
-def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise, ResidualBins]:
+def residual_spectrum(
+    series: Sequence[Series], fit: HarmonicFit
+) -> tuple[FundamentalNoise, ResidualBins]:
     """Return the noise of each channel's fundamental, and the bins that it comes from.
 
     Bins lie whole multiples of 2 pi / T beside omega. For the bins that all channels share, T is
@@ -206,7 +208,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
                 total[k] += late
     common = [common for common, _ in found]
     bins = _common_bins(groups, common, shortest, spread, rounding)
-    return Noise(level, dof, covariance), replace(bins, steps=steps)
+    return FundamentalNoise(level, dof, covariance), replace(bins, steps=steps)
 
 
 def _modulated(channel: Series, fit: HarmonicFit, k: int) -> FloatArray:
@@ -269,7 +271,7 @@ def _common_bins(
     return ResidualBins(values, offset[usable], spread, rounding)
 
 
-def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
+def omega_variance(fit: HarmonicFit, noise: FundamentalNoise) -> tuple[float, float]:
     """Return the variance of the shared frequency, from each channel's own noise.
 
     With information i, weight w and noise level s of each channel it is sum(w^2 i s) over

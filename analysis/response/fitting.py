@@ -12,7 +12,12 @@ from undulog.capture.common.console import Warn
 
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
-from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
+from ..estimators.spectrum import (
+    FundamentalNoise,
+    omega_variance,
+    residual_noise,
+    residual_spectrum,
+)
 from ..estimators.trends import Trend
 from ..estimators.turning import turning_beside_others
 from ..results.answer import Lacking, Note, Refusal, distinct, percent
@@ -450,8 +455,10 @@ def _usable(series: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
     return series.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
 
 
-def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Noise:
-    return Noise(noise.level[index], noise.dof[index], noise.covariance[index])
+def _pick(
+    noise: FundamentalNoise, index: np.ndarray[tuple[int], np.dtype[np.int64]]
+) -> FundamentalNoise:
+    return FundamentalNoise(noise.level[index], noise.dof[index], noise.covariance[index])
 
 
 def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], warn: Warn) -> None:

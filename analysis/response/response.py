@@ -21,7 +21,7 @@ from ..estimators.intervals import (
     t_factor,
     welch_satterthwaite,
 )
-from ..estimators.spectrum import Noise, ResidualBins
+from ..estimators.spectrum import FundamentalNoise, ResidualBins
 from ..results.estimate import Estimate
 
 
@@ -76,9 +76,9 @@ class Response:
 
 def respond(
     command: ComplexArray,
-    command_noise: Noise,
+    command_noise: FundamentalNoise,
     response: ComplexArray,
-    response_noise: Noise,
+    response_noise: FundamentalNoise,
     *,
     omega_variance: float = 0.0,
     delay_between_s: FloatArray | float = 0.0,

@@ -21,7 +21,7 @@ from scipy.interpolate import CubicHermiteSpline
 from undulog.capture.common.arrays import FloatArray
 from undulog.sim.gait.contract import CONTROL_RATE_HZ
 from undulog.sim.scenario.scenario import Kernels, Scenario
-from undulog.sim.scenario.sensors import SensorModels, SensorNoise
+from undulog.sim.scenario.sensors import Noise, SensorModels
 from undulog.sim.twin.twin import Plant, check_state
 
 from .parameters import Unknown, late_s, with_values
@@ -173,9 +173,7 @@ class Answers:
         self.on_tick()
         begun = time.perf_counter()
         # Commands were read as they were given: they are rounded already.
-        plain = [
-            dataclasses.replace(s, noise=SensorNoise(), sensing=SensorModels()) for s in scenarios
-        ]
+        plain = [dataclasses.replace(s, noise=Noise(), sensing=SensorModels()) for s in scenarios]
         runs = run_batch(plain, commands=[session.references] * len(plain))
         self.work.book(len(runs), session.scenario, begun)
         for run in runs:

@@ -40,7 +40,7 @@ from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
 from ..gait.contract import CONTROL_RATE_HZ, Readings
 from ..scenario.scenario import Scenario
-from ..scenario.sensors import AccelerometerModel, CompassModel, SensorNoise, ServoPolling
+from ..scenario.sensors import AccelerometerModel, CompassModel, Noise, ServoPolling
 from .contact import cross, into_frames, out_of_frames
 from .ranging import Infrared, RayCaster, Sonar
 from .sensing import (
@@ -239,7 +239,7 @@ class JointPolling:
     def __init__(
         self,
         servos: ServoPolling,
-        noise: SensorNoise,
+        noise: Noise,
         joint_count: int,
         *,
         period_steps: int,

@@ -30,7 +30,7 @@ from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import BusFault
 from .motion import Controller, GaitParameters, gait_table
 from .obstacles import Seed
-from .sensors import SensorModels, SensorNoise
+from .sensors import Noise, SensorModels
 from .world import Push, World, body_length, world_table
 
 MASS_FACTOR = "mass_factor"
@@ -209,7 +209,7 @@ class Scenario:
     duration_s: Length
     settle_s: NonNegative = 0.0
     world: World = field(default_factory=World)
-    noise: SensorNoise = field(default_factory=SensorNoise)
+    noise: Noise = field(default_factory=Noise)
     sensing: SensorModels = field(default_factory=SensorModels)
     modules: Modules = field(default_factory=Modules)
     disturbances: tuple[Push, ...] = ()

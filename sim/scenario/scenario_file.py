@@ -104,7 +104,7 @@ from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import read_faults
 from .motion import read_controller, read_gait
 from .scenario import LONGEST_S, Scenario, read_modules
-from .sensors import SensorNoise, read_sensing
+from .sensors import Noise, read_sensing
 from .world import read_pushes, read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
@@ -186,7 +186,7 @@ def parse_scenario(
         "robot_name": robot_name,
         "gait": read_gait(top.table("gait"), robot),
         "world": read_world(top.table("world"), robot, seed),
-        "noise": read(top.table("noise"), SensorNoise),
+        "noise": read(top.table("noise"), Noise),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
         "disturbances": read_pushes(top, robot),

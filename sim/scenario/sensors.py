@@ -103,7 +103,7 @@ def _side(robot: Robot, sensors: list[Sensor]) -> list[SideSensor]:
 
 
 @dataclass(frozen=True)
-class SensorNoise:
+class Noise:
     """White noise of what the servos report, as standard deviations.
 
     Attributes:

@@ -26,7 +26,7 @@ from undulog.capture.robot.null_model import NullModel, SharedParameter
 
 from ..gait.wave import Serpentine
 from ..scenario.scenario import MASS_FACTOR, Kernels, Modules, Scenario
-from ..scenario.sensors import SensorModels, SensorNoise
+from ..scenario.sensors import Noise, SensorModels
 from .twin import Twin
 
 HARMONICS = 3
@@ -145,7 +145,7 @@ def varied(scenario: Scenario, values: Mapping[str, float], variant: Variant) ->
         modules=modules,
         robot=modules.fitted(scenario.robot),
         world=dataclasses.replace(scenario.world, ground=ground),
-        noise=SensorNoise(),
+        noise=Noise(),
         sensing=SensorModels(),
     )
 

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at, fit_shared
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean
-from undulog.analysis.estimators.spectrum import Noise, omega_variance, residual_noise
+from undulog.analysis.estimators.spectrum import FundamentalNoise, omega_variance, residual_noise
 from undulog.analysis.response.response import gain_estimate, lag_estimate, respond
 from undulog.capture.common.errors import DataError
 
@@ -20,7 +20,7 @@ def coloured(rng, count, correlation):
 
 
 def part(noise, index):
-    return Noise(noise.level[index], noise.dof[index], noise.covariance[index])
+    return FundamentalNoise(noise.level[index], noise.dof[index], noise.covariance[index])
 
 
 class Trials:

@@ -10,7 +10,7 @@ from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.quantisation import draws, not_negative, rounding_covariance
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import (
-    Noise,
+    FundamentalNoise,
     ResidualBins,
     _common_bins,
     _Demodulated,
@@ -192,7 +192,7 @@ def test_chosen_channels_keep_their_bins():
 
 def test_variance_along_a_direction_is_a_quadratic_form():
     covariance = np.array([[[4.0, 1.0], [1.0, 2.0]], [[1.0, 0.0], [0.0, 9.0]]])
-    noise = Noise(np.ones(2), np.ones(2), covariance)
+    noise = FundamentalNoise(np.ones(2), np.ones(2), covariance)
     direction = np.array([0.6 + 0.8j, 1j])
     np.testing.assert_allclose(noise.along(direction), [0.36 * 4 + 2 * 0.48 + 0.64 * 2, 9.0])
 
@@ -204,14 +204,14 @@ def test_the_variance_of_a_shared_frequency():
         fit_at(series, 3.0), weight=np.array([4.0, 0.5]), information=np.array([3.0, 7.0])
     )
     block = np.zeros((2, 2, 2))
-    white = Noise(np.array([0.25, 2.0]), np.array([24.0, 8.0]), block)
+    white = FundamentalNoise(np.array([0.25, 2.0]), np.array([24.0, 8.0]), block)
     variance, dof = omega_variance(fit, white)
     assert variance == pytest.approx(1 / (3 / 0.25 + 7 / 2.0))
     parts = np.array([12.0, 3.5]) / 15.5**2
     assert dof == pytest.approx(parts.sum() ** 2 / (parts[0] ** 2 / 24 + parts[1] ** 2 / 8))
-    louder = Noise(np.array([0.75, 2.0]), np.array([24.0, 8.0]), block)
+    louder = FundamentalNoise(np.array([0.75, 2.0]), np.array([24.0, 8.0]), block)
     assert omega_variance(fit, louder)[0] == pytest.approx((3 * 12.0 + 3.5) / 15.5**2)
-    assert omega_variance(fit, Noise(np.zeros(2), np.ones(2), block)) == (0.0, 1.0)
+    assert omega_variance(fit, FundamentalNoise(np.zeros(2), np.ones(2), block)) == (0.0, 1.0)
     still = replace(fit, weight=np.zeros(2))
     assert omega_variance(still, white) == (float("inf"), 1.0)
 

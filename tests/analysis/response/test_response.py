@@ -9,7 +9,7 @@ from scipy import stats
 from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.intervals import ResponseErrors
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.estimators.spectrum import Noise, ResidualBins
+from undulog.analysis.estimators.spectrum import FundamentalNoise, ResidualBins
 from undulog.analysis.response.response import Response, gain_estimate, lag_estimate, respond
 from undulog.analysis.response.rhythm import (
     Rhythm,
@@ -26,7 +26,7 @@ from undulog.analysis.response.rhythm import (
 
 def noise_of(covariance, dof):
     covariance = np.array(covariance, dtype=float)
-    return Noise(np.ones(len(covariance)), np.array(dof, dtype=float), covariance)
+    return FundamentalNoise(np.ones(len(covariance)), np.array(dof, dtype=float), covariance)
 
 
 def test_a_response_has_the_variances_of_a_ratio():

@@ -7,7 +7,7 @@ import pytest
 
 from undulog.sim.physics.sensors import JointPolling
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.sensors import SensorNoise, ServoPolling
+from undulog.sim.scenario.sensors import Noise, ServoPolling
 
 DT, N, JOINTS = 1e-3, 10, 4
 
@@ -30,7 +30,7 @@ def periods(count, angle, rate, drive):
 
 def polling(servos=None, noise=None, seed=1):
     return JointPolling(
-        servos or ServoPolling(), noise or SensorNoise(), JOINTS, period_steps=N, dt=DT, seed=seed
+        servos or ServoPolling(), noise or Noise(), JOINTS, period_steps=N, dt=DT, seed=seed
     )
 
 
@@ -135,7 +135,7 @@ def test_within_its_dead_band_the_encoder_stands_still():
 
 
 def test_noise_is_white_and_has_the_asked_deviation():
-    noise = SensorNoise(position=1e-3, velocity=1e-2, effort=0.1)
+    noise = Noise(position=1e-3, velocity=1e-2, effort=0.1)
     run = moving(2000)
     samples = cycles(polling(noise=noise), run)
     for name, sigma in (("position", 1e-3), ("velocity", 1e-2), ("effort", 0.1)):

@@ -26,7 +26,7 @@ from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, GaitTick
 from undulog.sim.physics.sensing import JointSample
 from undulog.sim.scenario.bus_faults import parse_faults
-from undulog.sim.scenario.sensors import SensorModels, SensorNoise, ServoPolling
+from undulog.sim.scenario.sensors import Noise, SensorModels, ServoPolling
 from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
 from undulog.sim.serve.reply_frames import FaultLine, ReplyEncoder
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
@@ -57,7 +57,7 @@ def robot():
 @pytest.fixture(scope="module")
 def scenario(make_scenario, robot):
     sensing = SensorModels(servo=ServoPolling(0.0005, STEP, command_resolution=STEP))
-    return make_scenario(robot, duration_s=0.5, noise=SensorNoise(position=0.001), sensing=sensing)
+    return make_scenario(robot, duration_s=0.5, noise=Noise(position=0.001), sensing=sensing)
 
 
 class Running:
@@ -392,7 +392,7 @@ def test_a_servo_that_draws_too_much_says_so_and_nothing_else_is_changed(robot):
 
 def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
     stuck = parse_faults(["stuck:joint01@0.2"], robot)
-    quiet = dataclasses.replace(scenario.changed(duration_s=1.0), noise=SensorNoise())
+    quiet = dataclasses.replace(scenario.changed(duration_s=1.0), noise=Noise())
     live = running(quiet, lockstep=True, faults=stuck)
     for tick in range(quiet.tick_count):
         live.command([0.3 * math.sin(0.1 * tick), 0.0, 0.3 * math.sin(0.1 * tick), 0.0])
