@@ -69,7 +69,7 @@ def _guarded(name: str, function: Callable[P, T]) -> Callable[P, T]:
             raise
         except Exception as error:
             raise DataError(
-                f"the part {name!r} failed: {type(error).__name__}: {error}; mend or remove it"
+                f"the part {name!r} failed: {type(error).__name__}: {error}; correct or remove it"
             ) from error
 
     return call
