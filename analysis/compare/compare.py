@@ -335,13 +335,9 @@ def compare_fitted(
     )
     partial = _partial(aligned, " by their phase" if free else "")
     _warn(a, b, design, every_warning.append)
-    moved = {moved_offset.place for moved_offset in moved_offsets(decided)}
+    moved = {offset.place for offset in moved_offsets(decided)}
     # What stands off on one side is stated by the difference, which has an interval.
-    broken = tuple(
-        broken_joint
-        for broken_joint in broken_joints(a, b)
-        if broken_joint.kinds or broken_joint.name not in moved
-    )
+    broken = tuple(joint for joint in broken_joints(a, b) if joint.kinds or joint.name not in moved)
     alike = one_robot([one.facts for one in (*a, *b)]) and aligned.commands_differ is None
     verb = MOVED if alike and aligned.gaits_differ is None else DIFFERS
     verdict, sentence = answer_of(decided, partial is not None, broken, verb)

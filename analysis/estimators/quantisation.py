@@ -12,8 +12,8 @@ So the error is found by rounding again: the fitted motion, a little larger or s
 draw, at the very times of the samples, with the noise that the residual has beside the steps.
 
 A reading with hysteresis h is late by h / 2 in both directions, -(h / 2) sgn(v) of a motion with
-velocity v, whose fundamental (2 / pi) h lies at right angles to the motion's (Tustin, J. IEE 94 IIA
-(1947) 143-151, of backlash): a lag that the joint doesn't have. What the square wave has beyond the
+velocity v, whose fundamental (2 / pi) h lies at right angles to the motion's (of backlash: Tustin,
+J. IEE 94 IIA, 1947): a lag that the joint doesn't have. What the square wave has beyond the
 harmonics of the fit decides, by the likelihood of the residual after rounding. A dead band of the
 joint looks the same, and of more than a step or so it is one; up to that the lag's interval holds
 both.
@@ -58,7 +58,7 @@ _RANGE = 8.0
 _SHARE = 0.2
 
 _HYSTERESES = (0.25, 0.5, 0.75, 1.0, 1.25)
-"""In steps; a comparator's is one at most, or it is a fault (IEEE Std 1241-2010, 9.6)."""
+"""In steps: up to that of a count, and a quarter by which its estimate scatters."""
 
 _DEAD_BANDS = (1.5, 1.75, 2.0)
 """In steps: what fits better is a dead band of the joint."""
@@ -199,10 +199,7 @@ def hysteresis_covariance(
     amplitude = fit.fundamental[channel]
     if not abs(amplitude) > 2 * _HYSTERESES[-1] * step:
         return None
-    t_s, values = series.t_s, series.values
-    if series.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
-        index = np.sort(np.random.default_rng(0).choice(series.count, _LOOKED_AT, replace=False))
-        t_s, values = t_s[index], values[index]
+    t_s, values = some_samples(series, _LOOKED_AT)
     scale = time_scale(series.t_s)
     rows = basis(t_s, fit.omega, fit.model, scale)
     residual = (values - fit.parameters([channel], scale)[0] @ rows) / step
@@ -250,6 +247,17 @@ def _late(phase: FloatArray, width: float) -> FloatArray:
     since: FloatArray = np.where(phase < 0, phase + np.pi, phase)
     late: FloatArray = np.minimum((1 - np.cos(since)) / width, 1.0) - 0.5
     return np.where(phase < 0, -late, late)
+
+
+def some_samples(series: Series, most: int) -> tuple[FloatArray, FloatArray]:
+    """Return times and values of a channel, of many so many at random, always the same.
+
+    At random, as equal steps may be in step with the cycles.
+    """
+    if series.count <= most:
+        return series.t_s, series.values
+    index = np.sort(np.random.default_rng(0).choice(series.count, most, replace=False))
+    return series.t_s[index], series.values[index]
 
 
 def not_negative(symmetric: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ from .quantisation import (
     lattice_step,
     not_negative,
     rounding_covariance,
+    some_samples,
     steady_noise,
 )
 from .series import Series, shared_times
@@ -221,10 +222,7 @@ def _modulated(channel: Series, fit: HarmonicFit, k: int) -> FloatArray:
     first = fit.model.first
     weight = fit.inverse_gram[k][first : first + 2]
     block: FloatArray = weight[:, first : first + 2]
-    t_s, values = channel.t_s, channel.values
-    if channel.count > _LOOKED_AT:  # at random, as steps may be in step with the cycles
-        index = np.sort(np.random.default_rng(0).choice(channel.count, _LOOKED_AT, replace=False))
-        t_s, values = t_s[index], values[index]
+    t_s, values = some_samples(channel, _LOOKED_AT)
     scale = time_scale(channel.t_s)
     rows = basis(t_s, fit.omega, fit.model, scale)
     squares = (values - fit.parameters([k], scale)[0] @ rows) ** 2

@@ -20,7 +20,7 @@ from ..estimators.spectrum import (
 )
 from ..estimators.trends import Trend
 from ..estimators.turning import turning_beside_others
-from ..results.answer import Lacking, Note, Refusal, distinct, percent
+from ..results.answer import Lacking, Note, distinct, percent
 from ..results.estimate import Estimate
 from .changes import (
     LEAST_CYCLES,
@@ -53,7 +53,7 @@ from .rhythm import (
     driven,
     find_rhythm,
 )
-from .without_gait import few_cycles, too_seldom, why_no_gait
+from .without_gait import warn_no_gait
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""
@@ -150,7 +150,7 @@ def fit_gait(
         rhythm = find_rhythm(leading, duration_s)
         grouping = None if rhythm is None else Groups((rhythm,), rhythm.explained)
     if grouping is None or grouping.explained < MIN_EXPLAINED:
-        _warn_no_gait(leading, grouping, kind, duration_s, warn)
+        warn_no_gait(leading, grouping, kind, duration_s, warn)
         return None
     if not commands:
         return _responses_only(responses, grouping.rhythms[0])
@@ -177,15 +177,6 @@ def _swinging(commands: Mapping[str, Series], warn: Warn) -> Mapping[str, Series
         turn = "turns" if len(turning) == 1 else "turn"
         warn(Note(f"{', '.join(turning)} {turn} without end: gain and lag are null"))
     return {name: command for name, command in commands.items() if name not in turning}
-
-
-def _warn_no_gait(
-    series: Sequence[Series], groups: Groups | None, kind: str, duration_s: float, warn: Warn
-) -> None:
-    """Say why there is no gait; the answer begins with it where the record is to blame."""
-    unusable = too_seldom(series) or few_cycles(series, duration_s)
-    text = why_no_gait(series, groups, kind, duration_s, unusable)
-    warn(Lacking(text) if unusable is None else Refusal(text))
 
 
 def _select(

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError
 
 from ..estimators.harmonic import HarmonicModel, fit_at, fit_shared
 from ..estimators.series import Series, moves
-from ..results.answer import percent
+from ..results.answer import Lacking, Refusal, percent
 from .groups import Groups
 from .rhythm import MIN_CYCLES, MIN_EXPLAINED, MIN_SAMPLES, NYQUIST_SHARE, liveliest
 
@@ -183,3 +184,19 @@ def why_no_gait(
 
 def _moving(series: Sequence[Series]) -> list[Series]:
     return [channel for channel in series if channel.count > MIN_SAMPLES and moves(channel.values)]
+
+
+def warn_no_gait(
+    series: Sequence[Series], groups: Groups | None, kind: str, duration_s: float, warn: Warn
+) -> None:
+    """Warn why there is no gait; the answer begins with it where the record is to blame.
+
+    Args:
+        series: Channels in which no gait was found.
+        groups: Their best rhythms, however little these explain, or None.
+        kind: ``commands`` or ``responses``.
+        duration_s: Length of the window [s].
+    """
+    unusable = too_seldom(series) or few_cycles(series, duration_s)
+    text = why_no_gait(series, groups, kind, duration_s, unusable)
+    warn(Lacking(text) if unusable is None else Refusal(text))

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -25,6 +26,7 @@ T = TypeVar("T")
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
+@cache
 def added_parts() -> tuple[Part[Any], ...]:
     """Return the parts that other packages add, by name.
 

@@ -332,9 +332,7 @@ class _Source:
             if not len(block[self._time]):
                 continue
             t_ns = self._checked(self._times(block[self._time]), offset)
-            values = {
-                quantity: self._converted(column, block) for quantity, column in columns.items()
-            }
+            values = {key: self._converted(group, block) for key, group in columns.items()}
             yield _Messages(
                 (int(t_ns[0]), self._order),
                 int(t_ns[-1]),

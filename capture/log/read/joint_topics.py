@@ -296,10 +296,8 @@ class JointTopicFinder:
                     (command, candidate.name) not in robots,
                 ),
             )
-            if (
-                best.rank < _UNNAMED
-                or sum(response.rank == _UNNAMED for response in responses) == 1
-            ):
+            unnamed = sum(response.rank == _UNNAMED for response in responses)
+            if best.rank < _UNNAMED or unnamed == 1:
                 response = taken["positions"] = best.name
         if set(every.get(response, ())).isdisjoint(self._names_of(command, every)):
             # Joints of another part of the robot: a controller has its own states beside them.
@@ -311,7 +309,7 @@ class JointTopicFinder:
             ]
             if beside and response == RESPONSE_TOPIC:
                 response = taken["positions"] = beside[0].name
-        others = [command.name for command in (*commands, *responses)]
+        others = [candidate.name for candidate in (*commands, *responses)]
         arrays = [topic for topic, kind, _ in self._joint_topics() if kind in FLOAT_ARRAYS]
         taken_topics = {candidate.topic for candidate in commands if candidate.name == command}
         others += [f"{topic}:JOINT,..." for topic in arrays if topic not in taken_topics]
