@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
@@ -446,9 +447,7 @@ def _usable(series: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
     return series.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
 
 
-def _pick(
-    noise: FundamentalNoise, index: np.ndarray[tuple[int], np.dtype[np.int64]]
-) -> FundamentalNoise:
+def _pick(noise: FundamentalNoise, index: IntArray) -> FundamentalNoise:
     return FundamentalNoise(noise.level[index], noise.dof[index], noise.covariance[index])
 
 
