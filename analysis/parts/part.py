@@ -17,8 +17,8 @@ from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
     from ..results.answer import Remarks
+    from ..signals.session_signals import Signals
     from .shown import Shown
-    from .signals import Signals
 
 R = TypeVar("R")
 

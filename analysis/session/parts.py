@@ -18,7 +18,6 @@ from ..energy import Energies, check_ledger, energy_result, joint_energies, tran
 from ..estimators.series import Series
 from ..oscillators.chain import closed_loop, session_couplings
 from ..parts.part import Part, Results
-from ..parts.signals import Signals
 from ..parts.tracking.gait import gait_offsets
 from ..parts.tracking.measure import Tracked, track_joints
 from ..response.fitting import GaitFit, fit_at_period, fit_gait
@@ -40,6 +39,7 @@ from ..segments.session import (
 )
 from ..signals.artefacts import find_artefacts
 from ..signals.columns import by_plane
+from ..signals.session_signals import Signals
 from ..signals.stretch import series_in
 from ..signals.windows import Span, Stretch, whole_cycles
 from .cycles import response_over_time

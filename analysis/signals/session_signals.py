@@ -13,8 +13,8 @@ from undulog.capture.robot.model import Robot
 
 from ..estimators.series import Series
 from ..results.answer import Note, Remarks
-from ..signals.columns import Columns, read_columns
-from ..signals.stretch import (
+from .columns import Columns, read_columns
+from .stretch import (
     Choice,
     Options,
     choose_stretch,
@@ -23,7 +23,7 @@ from ..signals.stretch import (
     series_in,
     without_breaks,
 )
-from ..signals.windows import Stretch
+from .windows import Stretch
 
 _FEW = 1e-3
 """Up to one sample in a thousand left out is a note: no loss for a fit."""

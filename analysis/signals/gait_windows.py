@@ -20,8 +20,8 @@ from scipy.special import gammainccinv, gammaincinv
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ...estimators.series import Series, moves
-from ...response.rhythm import (
+from ..estimators.series import Series, moves
+from ..response.rhythm import (
     DRIVEN_SHARE,
     MIN_CYCLES,
     MIN_EXPLAINED,

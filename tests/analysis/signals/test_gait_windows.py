@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.parts.gaits.windows import several_gaits
+from undulog.analysis.signals.gait_windows import several_gaits
 
 
 def commands(pace_hz, *, joints=4, rate_hz=50.0, noise=0.0, amplitude=None, seed=0):
