@@ -165,14 +165,14 @@ def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
 def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
     if not t_ns.size:
         return t_ns.astype(np.float64)
-    known = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]))
-    if known.count < 2:
+    series = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]))
+    if series.count < 2:
         return np.full(t_ns.size, np.nan)
     t_s = (t_ns - t_ns[0]).astype(np.float64) * 1e-9
-    values = known.at(t_s)
-    values[(t_s < known.t_s[0]) | (t_s > known.t_s[-1])] = np.nan
-    for k in known.gaps:
-        values[(t_s > known.t_s[k]) & (t_s < known.t_s[k + 1])] = np.nan
+    values = series.at(t_s)
+    values[(t_s < series.t_s[0]) | (t_s > series.t_s[-1])] = np.nan
+    for k in series.gaps:
+        values[(t_s > series.t_s[k]) & (t_s < series.t_s[k + 1])] = np.nan
     return values
 
 
@@ -202,8 +202,8 @@ def joint_energies(
 ) -> dict[str, Energies]:
     """Return the energies of all joints; warn of powers with gaps or falsified by a sensor."""
     wrong = list(artefacts)
-    false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
-    false_el = {one.joint for one in wrong if one.falsifies("current", "voltage")}
+    false = {artefact.joint for artefact in wrong if artefact.falsifies("velocity", "effort")}
+    false_el = {artefact.joint for artefact in wrong if artefact.falsifies("current", "voltage")}
     for joints, kind in ((false, "mechanical"), (false_el, "electrical")):
         if joints:
             named = ", ".join(name for name in columns.names if name in joints)
@@ -225,15 +225,17 @@ def joint_energies(
         energies |= zip(powers, integrate([*powers.values()], *window), strict=True)
         return Energies(energies.get("mechanical"), energies.get("electrical"), frozenset(powers))
 
-    samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
-    found = in_threads(of_joint, columns.names, samples, session.forget)
-    result = dict(zip(columns.names, found, strict=True))
+    samples = sum(
+        signal.t_ns.size for signal in (*columns.effort.values(), *columns.current.values())
+    )
+    measured = in_threads(of_joint, columns.names, samples, session.forget)
+    result = dict(zip(columns.names, measured, strict=True))
 
     def has_gaps(energies: Energies) -> bool:
         both = energies.mechanical, energies.electrical
-        return any(each is not None and each.coverage < 1 - GAP_SHARE for each in both)
+        return any(energy is not None and energy.coverage < 1 - GAP_SHARE for energy in both)
 
-    if thin := [name for name, one in result.items() if has_gaps(one)]:
+    if thin := [name for name, energies in result.items() if has_gaps(energies)]:
         warn(
             f"the power of {', '.join(thin)} has gaps, which are not bridged: energies count only "
             "the time that has samples"
@@ -249,7 +251,7 @@ def _accumulated(
     net, plus = (columns.powers[topic].get(name) for topic in topics)
     if net is None or plus is None:
         return None
-    mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
+    mean, positive = (clean(name, signal.t_ns, signal.values, origin_ns) for signal in (net, plus))
     return add_up(mean, positive, *window)
 
 
@@ -320,8 +322,8 @@ def _unknown(energies: Iterable[Energies]) -> str | None:
 
 def _all_steady(voltages: Iterable[FloatArray]) -> bool:
     for values in voltages:
-        known = values[np.isfinite(values)]
-        if known.size and np.ptp(known) > STEADY_SHARE * abs(float(known.mean())):
+        finite = values[np.isfinite(values)]
+        if finite.size and np.ptp(finite) > STEADY_SHARE * abs(float(finite.mean())):
             return False
     return True
 
@@ -348,17 +350,17 @@ def check_ledger(
         return None
     if booked is None:
         return None
-    found = whole_robot(energies)
+    totals = whole_robot(energies)
     off: dict[str, float] = {}
     for name, (kind, _, term) in TERMS.items():
-        if name in found and term in booked:
-            off[name] = found[name] - booked[term]
-            scale = max(found["abs" if kind == "mechanical" else "el_abs"], abs(booked[term]))
+        if name in totals and term in booked:
+            off[name] = totals[name] - booked[term]
+            scale = max(totals["abs" if kind == "mechanical" else "el_abs"], abs(booked[term]))
             if name in ("net", "el") and abs(off[name]) > TOLERANCE * scale:
                 warn(
-                    f"{kind} energy is {found[name]:.4g} J from the samples but {booked[term]:.4g} "
-                    f"J in the twin's ledger ({LEDGER_TOPIC}): samples once a control cycle miss "
-                    "what happens within it"
+                    f"{kind} energy is {totals[name]:.4g} J from the samples but "
+                    f"{booked[term]:.4g} J in the twin's ledger ({LEDGER_TOPIC}): samples once a "
+                    "control cycle miss what happens within it"
                 )
     whole = booked.get("mechanical_abs", 0.0)
 
@@ -407,8 +409,8 @@ def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
     joints = list(energies)
     sums: dict[str, float] = {}
     for name, (kind, part, _) in {**TERMS, "el_abs": ("electrical", "abs_j", "")}.items():
-        if known := [one for joint in joints if (one := getattr(joint, kind)) is not None]:
-            sums[name] = sum(float(getattr(one, part).sum()) for one in known)
+        if measured := [energy for joint in joints if (energy := getattr(joint, kind)) is not None]:
+            sums[name] = sum(float(getattr(energy, part).sum()) for energy in measured)
     return sums
 
 
@@ -473,10 +475,10 @@ def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str
     return [f"{moved}, which does not differ significantly from 0"]
 
 
-def in_all(found: Sequence[FloatArray | None]) -> FloatArray | None:
+def in_all(energies_j: Sequence[FloatArray | None]) -> FloatArray | None:
     """Return the energy of all joints together in each cycle [J]; None if one is unknown."""
-    known = [one for one in found if one is not None]
-    return np.sum(known, axis=0) if known and len(known) == len(found) else None
+    measured = [energy_j for energy_j in energies_j if energy_j is not None]
+    return np.sum(measured, axis=0) if measured and len(measured) == len(energies_j) else None
 
 
 def _ratio(above: FloatArray, below: FloatArray) -> Estimate:

@@ -141,8 +141,8 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
     """
     cosine, sine = cos_sin(omega * t_s)
     filled = np.diff(starts)
-    along, across = (cycle_sums(one, starts) for one in (cosine, sine))
-    square, mixed = (cycle_sums(cosine * one, starts) for one in (cosine, sine))
+    along, across = (cycle_sums(wave, starts) for wave in (cosine, sine))
+    square, mixed = (cycle_sums(cosine * wave, starts) for wave in (cosine, sine))
     other = cycle_sums(sine * sine, starts)  # not the rest of the count: 0 would be singular
     gram = np.array(  # of 1, cos and -sin
         [[filled, along, -across], [along, square, -mixed], [-across, -mixed, other]]
@@ -154,12 +154,12 @@ def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: flo
             -cycle_sums(values * sine, starts),
         ]
     )
-    known: BoolArray = filled >= _LEAST_SAMPLES
+    enough: BoolArray = filled >= _LEAST_SAMPLES
     result = np.full(right.shape[1:], np.nan, dtype=np.complex128)
     channels = int(np.prod(right.shape[1:-1]))
-    each = right[..., known].reshape(3, channels, np.count_nonzero(known))
-    solved = np.linalg.solve(gram.T[known], each.transpose(2, 0, 1))
-    result[..., known] = (solved[:, 1] + 1j * solved[:, 2]).T.reshape(result[..., known].shape)
+    sums = right[..., enough].reshape(3, channels, np.count_nonzero(enough))
+    solved = np.linalg.solve(gram.T[enough], sums.transpose(2, 0, 1))
+    result[..., enough] = (solved[:, 1] + 1j * solved[:, 2]).T.reshape(result[..., enough].shape)
     return result
 
 
@@ -274,17 +274,17 @@ def cycles_of(
         second = np.abs(ratio[:-2] - 2 * ratio[1:-1] + ratio[2:]) ** 2
         squares.append(second / (share[:-2] + 4 * share[1:-1] + share[2:]))
     ratio = np.concatenate(ratios)
-    known = np.concatenate(squares)
-    usable, after = np.isfinite(known), np.concatenate(late)
+    scatter = np.concatenate(squares)
+    usable, after = np.isfinite(scatter), np.concatenate(late)
     if np.count_nonzero(usable & after) >= MIN_DIFFERENCES:
         usable &= after
-    known = known[usable]
+    scatter = scatter[usable]
     answer = np.abs(np.concatenate(given)) ** 2
     variance = np.full(ratio.size, np.nan)
     dof = 0.0
-    if known.size >= MIN_DIFFERENCES:
-        variance = np.divide(known.mean() / 2, answer, out=variance, where=answer > 0)
-        dof = _difference_dof(known.size)
+    if scatter.size >= MIN_DIFFERENCES:
+        variance = np.divide(scatter.mean() / 2, answer, out=variance, where=answer > 0)
+        dof = _difference_dof(scatter.size)
     starts, stops = ([edge[:-1] for edge in edges], [edge[1:] for edge in edges])
     return CycleResponses(np.concatenate(starts), np.concatenate(stops), ratio, variance, dof)
 
@@ -334,8 +334,8 @@ def _moments(
     # So many cycles at a time that their rows stay in the processor's cache.
     many = max(1, _TOGETHER * count // max(int(starts[-1] - starts[0]), 1))
     for first in range(0, count, many):
-        own = starts[first : first + many + 1]
-        part = slice(int(own[0]), int(own[-1]))
+        edges = starts[first : first + many + 1]
+        part = slice(int(edges[0]), int(edges[-1]))
         rows = np.empty((14, part.stop - part.start))
         turns = rows[:8].reshape(4, 2, rows.shape[1])
         turns[0, 0], turns[0, 1] = cos_sin(phase[part])
@@ -348,7 +348,7 @@ def _moments(
         rows[8] = values[part]
         np.multiply(rows[:4], rows[8], out=rows[9:13])
         np.multiply(rows[8], rows[8], out=rows[13])
-        sums[:, first : first + many] = cycle_sums(rows, own - own[0])
+        sums[:, first : first + many] = cycle_sums(rows, edges - edges[0])
     return sums[:8].reshape(4, 2, count), sums[8:13], sums[13]
 
 

@@ -196,7 +196,7 @@ def solve(series: Sequence[Series], omega: float, model: HarmonicModel) -> Solve
 def _moments(group: Sequence[Series], omega: float, model: HarmonicModel) -> Moments:
     t_s = group[0].t_s
     scale = time_scale(t_s)
-    mean = np.array([one.values.mean() for one in group])
+    mean = np.array([channel.values.mean() for channel in group])
     p, q = model.size, model.size + 2 * model.harmonics
     gram = np.zeros((q, q))
     cross = np.zeros((q, len(group)))
@@ -204,7 +204,7 @@ def _moments(group: Sequence[Series], omega: float, model: HarmonicModel) -> Mom
     for part in chunks(t_s.size):
         rows = basis(t_s[part], omega, model, scale, spare=q - p)
         np.multiply(rows[model.first : p], t_s[part] / scale, out=rows[p:])
-        values = np.stack([one.values[part] for one in group]) - mean[:, None]
+        values = np.stack([channel.values[part] for channel in group]) - mean[:, None]
         gram += rows @ rows.T
         cross += rows @ values.T
         power += np.einsum("kn,kn->k", values, values)
@@ -408,11 +408,11 @@ _Part = tuple[list[int], Solved]
 def _groups(series: Sequence[Series], model: HarmonicModel) -> list[_Group]:
     if not series:
         raise DataError("nothing to fit: no channel has samples in the window")
-    for one in series:
-        if one.count <= model.size + 1:
+    for channel in series:
+        if channel.count <= model.size + 1:
             raise DataError(
-                f"{one.name}: {one.count} samples are too few to fit {model.size} parameters "
-                "and a frequency; take a longer window"
+                f"{channel.name}: {channel.count} samples are too few to fit {model.size} "
+                "parameters and a frequency; take a longer window"
             )
     return [(members, [series[k] for k in members]) for members in shared_times(series)]
 
@@ -421,16 +421,18 @@ def _solve_groups(groups: Sequence[_Group], omega: float, model: HarmonicModel) 
     def part(group: _Group) -> _Part:
         return group[0], solve(group[1], omega, model)
 
-    return in_threads(part, groups, sum(one.count for _, series in groups for one in series))
+    return in_threads(
+        part, groups, sum(channel.count for _, series in groups for channel in series)
+    )
 
 
 def _gauss_newton_step(solved: Sequence[_Part]) -> float:
     """Step of omega: sum w g^T r / sum w |P g|^2, weights one over residual variance [rad/s]."""
     numerator = denominator = 0.0
-    for _, one in solved:
+    for _, solution in solved:
         # The scaled time makes both sums dimensionless in time; one division undoes it.
-        numerator += float(one.weight @ one.projected) * one.moments.scale
-        denominator += float(one.weight @ one.squared) * one.moments.scale**2
+        numerator += float(solution.weight @ solution.projected) * solution.moments.scale
+        denominator += float(solution.weight @ solution.squared) * solution.moments.scale**2
     if denominator == 0:
         raise DataError("no frequency fits: every channel is constant")
     return numerator / denominator
@@ -445,20 +447,20 @@ def _gathered(
     lines = np.zeros((count, len(model.lines)), dtype=np.complex128)
     inverse = np.zeros((count, model.size, model.size))
     information, weight, rss, total, samples, mean_time = np.zeros((6, count))
-    for k, one in solved:
-        moments = one.moments
+    for k, solution in solved:
+        moments = solution.moments
         scale = moments.scale ** -np.arange(model.trend + 1.0)
-        theta = one.theta + one.drift * (step * moments.scale)
+        theta = solution.theta + solution.drift * (step * moments.scale)
         trend[k] = (theta[: model.trend + 1] * scale[:, None]).T
         trend[k, 0] += moments.mean
         parts = theta[model.first :].reshape(model.harmonics, 2, len(k))
         amplitudes[k] = (parts[:, 0] + 1j * parts[:, 1]).T
         others = theta[model.trend + 1 : model.first].reshape(len(model.lines), 2, len(k))
         lines[k] = (others[:, 0] + 1j * others[:, 1]).T
-        inverse[k] = one.inverse_gram
-        left = one.rss - 2 * one.projected * (step * moments.scale)
-        weight[k], rss[k], total[k] = one.weight, np.maximum(left, 0.0), moments.power
-        information[k] = one.squared * moments.scale**2
+        inverse[k] = solution.inverse_gram
+        left = solution.rss - 2 * solution.projected * (step * moments.scale)
+        weight[k], rss[k], total[k] = solution.weight, np.maximum(left, 0.0), moments.power
+        information[k] = solution.squared * moments.scale**2
         samples[k], mean_time[k] = moments.count, moments.mean_time
     return HarmonicFit(
         omega=float(omega + step),

@@ -109,17 +109,17 @@ def response_errors(
     """
     parts: list[ComplexArray] = []
     rounding, steps = np.zeros((2, response.size, 2, 2))
-    for amplitude, found in ((response, response_bins), (command, command_bins)):
-        known = np.abs(amplitude) > 0
+    for amplitude, bins in ((response, response_bins), (command, command_bins)):
+        nonzero = np.abs(amplitude) > 0
         inverse = np.full(amplitude.shape, np.nan, dtype=np.complex128)
-        np.divide(1.0, amplitude, out=inverse, where=known)
-        parts.append((inverse * np.sqrt(found.spread))[:, None] * found.values)
+        np.divide(1.0, amplitude, out=inverse, where=nonzero)
+        parts.append((inverse * np.sqrt(bins.spread))[:, None] * bins.values)
         # Multiplied by 1/a, errors of (Re a, Im a) become those of (ln|a|, arg a).
         turned = np.stack([inverse, 1j * inverse], axis=1)
         turned = np.stack([turned.real, turned.imag], axis=1)
-        rounding += turned @ found.rounding @ turned.transpose(0, 2, 1)
-        if found.steps is not None:
-            steps += turned @ found.steps @ turned.transpose(0, 2, 1)
+        rounding += turned @ bins.rounding @ turned.transpose(0, 2, 1)
+        if bins.steps is not None:
+            steps += turned @ bins.steps @ turned.transpose(0, 2, 1)
     turn = np.zeros(response.size) + omega_variance**0.5 * np.asarray(delay_between_s)
     alone = np.einsum("mii->mi", steps)
     return ResponseErrors(parts[0] - parts[1], rounding, turn, alone)
@@ -251,7 +251,7 @@ def norm_ratio(
     (top, top_half), (bottom, bottom_half) = (
         _norm(*pair) for pair in ((above, above_noise), (below, below_noise))
     )
-    plain = [float(np.linalg.norm(one)) for one in (above, below)]
+    plain = [float(np.linalg.norm(values)) for values in (above, below)]
     if bottom == 0:
         return Estimate()
     if plain[1] <= bottom_half:
@@ -287,9 +287,9 @@ def mixture_interval(
     quantile = np.array([[(1 - CONFIDENCE) / 2], [(1 + CONFIDENCE) / 2]])
     peak = float(np.exp(gammaln((dof + 1) / 2) - gammaln(dof / 2))) / (np.pi * dof) ** 0.5
     # Newton's steps from where all parts have their own quantile, within what brackets it.
-    own = mean[:, np.newaxis] + stdtrit(dof, quantile) * scale[:, np.newaxis]
-    low, high = own.min(axis=0), own.max(axis=0)
-    ends: FloatArray = (share[:, np.newaxis] * own).sum(axis=0)
+    bounds = mean[:, np.newaxis] + stdtrit(dof, quantile) * scale[:, np.newaxis]
+    low, high = bounds.min(axis=0), bounds.max(axis=0)
+    ends: FloatArray = (share[:, np.newaxis] * bounds).sum(axis=0)
     for _ in range(_MOST_STEPS):
         t = (ends - mean[:, np.newaxis]) / scale[:, np.newaxis]
         excess: FloatArray = np.sum(share[:, np.newaxis] * stdtr(dof, t), axis=0) - quantile
@@ -310,5 +310,5 @@ def positive_interval(values: FloatArray, weights: FloatArray) -> tuple[float, f
     running = np.cumsum(weights[order])
     middle = running - weights[order] / 2
     levels = (0.5, (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
-    found = np.exp(np.interp(levels, middle, np.log(values[order])))
-    return float(found[0]), float(found[1]), float(found[2])
+    quantiles = np.exp(np.interp(levels, middle, np.log(values[order])))
+    return float(quantiles[0]), float(quantiles[1]), float(quantiles[2])

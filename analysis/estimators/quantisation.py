@@ -100,23 +100,23 @@ def _common_step(apart: FloatArray, blur: float) -> float:
     apart = apart[apart > blur]
     if apart.size + 1 < _FEWEST:
         return 0.0
-    step, known = float(apart.min()), 1.0
+    step, most_steps = float(apart.min()), 1.0
     # Euclid's algorithm with real numbers: what is left of a difference is a multiple, too. The
     # step is known within the blur over the most steps that it was measured over.
     for whole in np.unique(apart).tolist():
         other = whole
         while True:
             count = round(other / step)
-            doubt = blur * (1 + count / known)
+            doubt = blur * (1 + count / most_steps)
             left = abs(other - count * step)
             if step < _SHARPEST * doubt:
                 return 0.0
             if left <= doubt:
                 break
-            other, step, known = step, left, blur / doubt
+            other, step, most_steps = step, left, blur / doubt
         count = round(whole / step)
-        if count > known:
-            step, known = whole / count, float(count)
+        if count > most_steps:
+            step, most_steps = whole / count, float(count)
     return float(apart.sum() / np.rint(apart / step).sum())
 
 

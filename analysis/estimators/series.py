@@ -162,9 +162,9 @@ def clean_together(signals: Mapping[str, Signal], origin_ns: int) -> dict[str, S
     series: dict[str, Series] = {}
     times: dict[int, Series] = {}
     for key, signal in signals.items():
-        known = times.get(id(signal.t_ns))
-        if known is not None and (np.abs(signal.values) <= LARGEST).all():
-            series[key] = Series(signal.name, known.t_s, frozen(signal.values.view()))
+        earlier = times.get(id(signal.t_ns))
+        if earlier is not None and (np.abs(signal.values) <= LARGEST).all():
+            series[key] = Series(signal.name, earlier.t_s, frozen(signal.values.view()))
             continue
         series[key] = made = clean(signal.name, signal.t_ns, signal.values, origin_ns)
         if np.may_share_memory(made.values, signal.values):  # nothing was left out or moved
@@ -239,10 +239,10 @@ def shared_times(series: Sequence[Series]) -> list[list[int]]:
         Indices into ``series``, grouped; every index once.
     """
     groups: list[list[int]] = []
-    for i, one in enumerate(series):
+    for i, channel in enumerate(series):
         for group in groups[-1:]:
             first = series[group[0]].t_s
-            if first is one.t_s or np.array_equal(first, one.t_s):
+            if first is channel.t_s or np.array_equal(first, channel.t_s):
                 group.append(i)
                 break
         else:

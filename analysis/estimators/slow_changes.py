@@ -176,14 +176,14 @@ def _excess(shapes: Shapes, white: _Noise, series: FloatArray, noise: CycleNoise
     """Return the chance that noise within cycles makes the scatter between them."""
     fits = _fit(shapes, white, series)
     s = int(np.argmax(fits.full))
-    known = noise.variance > 0
-    if not np.any(known):
+    usable = noise.variance > 0
+    if not np.any(usable):
         return 0.0
     n, p = shapes.designs.shape[1:]
     if n <= p:
         return 1.0
     half = (n - p) / 2
-    ratio: FloatArray = np.log(fits.rss[s][known] / (n - p) / noise.variance[known])
+    ratio: FloatArray = np.log(fits.rss[s][usable] / (n - p) / noise.variance[usable])
     expected = _digamma(half) - math.log(half)
     # Gains and lags have one estimate of the noise.
     error = _trigamma(half) + 2 * noise.log_variance
@@ -328,13 +328,13 @@ def _clearest(series: FloatArray, place: FloatArray, noises: Sequence[_Noise]) -
     best, chosen = np.inf, none
     for family in families(place):
         fits = {k: _fit(family, noises[k], series) for k in tried}
-        found = _posterior(family, [fits[k] for k in tried], [noises[k] for k in tried], series)
+        posterior = _posterior(family, [fits[k] for k in tried], [noises[k] for k in tried], series)
         chance, total = np.zeros(family.tau.size), 0.0
         for i, j in product(*likely):
             share = float(weights[0, i] * weights[1, j])
-            before = np.concatenate([one.rss[0] for one in _halves(null[i], null[j])])
-            after = np.concatenate([one.rss for one in _halves(fits[i], fits[j])], axis=1)
-            chance += share * _chance(before, after, family, found.temper)
+            before = np.concatenate([fit.rss[0] for fit in _halves(null[i], null[j])])
+            after = np.concatenate([fit.rss for fit in _halves(fits[i], fits[j])], axis=1)
+            chance += share * _chance(before, after, family, posterior.temper)
             total += share
         if not _TRIALS[family.kind] * float(chance.min()) / total <= SIGNIFICANT:
             continue
@@ -404,41 +404,47 @@ def _inferred(
 ) -> SlowChanges:
     """Weigh the grid and give the coefficients."""
     fits = [_fit(shapes, noise, series) for noise in noises]
-    found = _posterior(shapes, fits, noises, series)
+    posterior = _posterior(shapes, fits, noises, series)
     columns = shapes.designs.shape[2]
     half = series.shape[0] // 2
     dof = series.shape[1] - columns
-    correlated = 1 - found.weights[:, 0].sum(axis=1)
-    rss = [fits[i].rss[s].reshape(2, half)[part] for part, (i, s) in enumerate(found.best)]
-    alike = abs(correlated[0] - correlated[1]) < _HALF and _alike(rss[0], rss[1], dof, found.temper)
+    correlated = 1 - posterior.weights[:, 0].sum(axis=1)
+    rss = [fits[i].rss[s].reshape(2, half)[part] for part, (i, s) in enumerate(posterior.best)]
+    alike = abs(correlated[0] - correlated[1]) < _HALF and _alike(
+        rss[0], rss[1], dof, posterior.temper
+    )
     first, change = np.zeros(columns), _changes(shapes, place)
     first[0] = 1.0
     firsts = np.broadcast_to(first, change.shape)
     level, turned = (
-        _mixture(fits, found.weights, each, dof, alike=alike) for each in (firsts, change)
+        _mixture(fits, posterior.weights, contrast, dof, alike=alike)
+        for contrast in (firsts, change)
     )
     own_shares = np.stack([fit.cov[:, 0, 0] for fit in fits])  # of the variance, (noises, s)
     residuals: list[FloatArray] = []
     shares: list[float] = []
-    for part, (i, s) in enumerate(found.best):
-        own = slice(part * half, (part + 1) * half)
+    for part, (i, s) in enumerate(posterior.best):
+        rows = slice(part * half, (part + 1) * half)
         noise = noises[i]
         whole: FloatArray = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")[0]
-        residuals.append(series[own] @ noise.whiten.T @ whole[:, columns:])
+        residuals.append(series[rows] @ noise.whiten.T @ whole[:, columns:])
         shares.append(float(fits[i].cov[s, 0, 0]))
     return SlowChanges(
         trend=Trend.SETTLING if shapes.free else Trend(shapes.kind),
         level=level,
         change=turned,
-        tau=positive_interval(shapes.tau, found.weights[0].sum(axis=0)),
-        turn=float(shapes.turn[found.best[0][1]]),
-        correlation=(noises[found.best[0][0]].correlation, noises[found.best[1][0]].correlation),
+        tau=positive_interval(shapes.tau, posterior.weights[0].sum(axis=0)),
+        turn=float(shapes.turn[posterior.best[0][1]]),
+        correlation=(
+            noises[posterior.best[0][0]].correlation,
+            noises[posterior.best[1][0]].correlation,
+        ),
         alike=alike,
         dof=dof,
         excess=excess,
         residuals=np.concatenate(residuals),
         share=(shares[0], shares[1]),
-        effective=1 / float((found.weights * own_shares).sum(axis=(1, 2)).max()),
+        effective=1 / float((posterior.weights * own_shares).sum(axis=(1, 2)).max()),
     )
 
 

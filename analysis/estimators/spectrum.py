@@ -176,10 +176,10 @@ def residual_spectrum(
             return common, common
         return common, _demodulated(group, fit, members, spans[members[0]])
 
-    found = in_threads(demodulated, groups, sum(channel.count for channel in series))
-    for members, (_, own) in zip(groups, found, strict=True):
-        usable = own.usable()
-        level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
+    spectra = in_threads(demodulated, groups, sum(channel.count for channel in series))
+    for members, (_, spectrum) in zip(groups, spectra, strict=True):
+        usable = spectrum.usable()
+        level[members] = np.mean(spectrum.power()[:, usable] / spectrum.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
     floor = np.maximum(RELATIVE_FLOOR * fit.total / fit.count - level, 0.0)
     level += floor
@@ -207,7 +207,7 @@ def residual_spectrum(
         if late is not None:
             for total in (covariance, rounding, steps):
                 total[k] += late
-    common = [common for common, _ in found]
+    common = [common for common, _ in spectra]
     bins = _common_bins(groups, common, shortest, spread, rounding)
     return FundamentalNoise(level, dof, covariance), replace(bins, steps=steps)
 
@@ -237,33 +237,33 @@ def _rounded(
     series: Sequence[Series], fit: HarmonicFit, level: FloatArray, lattices: Sequence[float]
 ) -> list[tuple[int, FloatArray]]:
     """Return the channels whose rounding no noise makes white, and the covariance that it makes."""
-    found: list[tuple[int, float, float]] = []
+    coarse: list[tuple[int, float, float]] = []
     for k, step in enumerate(lattices):
         noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
         if noise is not None:
-            found.append((k, step, noise))
+            coarse.append((k, step, noise))
 
     def rounded(item: tuple[int, float, float]) -> tuple[int, FloatArray]:
         k, step, noise = item
         return k, rounding_covariance(series[k], fit, k, step, noise)
 
-    return in_threads(rounded, found, sum(DRAWS * series[k].count for k, *_ in found))
+    return in_threads(rounded, coarse, sum(DRAWS * series[k].count for k, *_ in coarse))
 
 
 def _common_bins(
     groups: Sequence[Sequence[int]],
-    found: Sequence[_Demodulated],
+    spectra: Sequence[_Demodulated],
     span: float,
     spread: FloatArray,
     rounding: FloatArray,
 ) -> ResidualBins:
     """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
-    kept = np.min([one.kept / one.count for one in found], axis=0)
+    kept = np.min([spectrum.kept / spectrum.count for spectrum in spectra], axis=0)
     pairs = np.minimum(kept[::2], kept[1::2])
     usable = np.repeat(pairs > min(KEPT_POWER, 0.999 * float(pairs.max())), 2)
     values = np.zeros((spread.size, np.count_nonzero(usable)), dtype=np.complex128)
-    for members, one in zip(groups, found, strict=True):
-        values[members] = one.transform[:, usable] / np.sqrt(one.kept[usable])
+    for members, spectrum in zip(groups, spectra, strict=True):
+        values[members] = spectrum.transform[:, usable] / np.sqrt(spectrum.kept[usable])
     offset: FloatArray = np.repeat(np.arange(1.0, pairs.size + 1), 2) * (2 * np.pi / span)
     offset[1::2] *= -1
     return ResidualBins(values, offset[usable], spread, rounding)
@@ -326,7 +326,7 @@ def residuals(
     wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
         rows = basis(t_s[part], fit.omega, wider, scale)
-        residual = np.stack([one.values[part] for one in group])
+        residual = np.stack([channel.values[part] for channel in group])
         residual -= theta @ rows[: fit.model.size]
         yield Residual(part, rows, rows[first : first + 2, None] * residual)
 

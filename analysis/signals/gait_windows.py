@@ -178,7 +178,9 @@ def _families(periods: Iterable[float]) -> list[list[float]]:
 def _apart(windows: Sequence[Repeats]) -> list[Repeats]:
     """Windows that don't overlap: the longest first, of equal ones that of the shortest period."""
     kept: list[Repeats] = []
-    for window in sorted(windows, key=lambda each: each.start_s - each.stop_s + each.period_s):
+    for window in sorted(
+        windows, key=lambda repeats: repeats.start_s - repeats.stop_s + repeats.period_s
+    ):
         start_s, stop_s = window.start_s, window.stop_s
         for other in kept:
             if other.start_s <= start_s < other.stop_s:
@@ -241,7 +243,9 @@ class _Grid:
     def of(cls, commands: Sequence[Series], start_s: float, stop_s: float) -> _Grid | None:
         """Interpolate the commands between two times; joints that hardly move are left out."""
         inside = [command.between(start_s, stop_s) for command in commands]
-        moving = [each for each in inside if each.count > MIN_SAMPLES and moves(each.values)]
+        moving = [
+            command for command in inside if command.count > MIN_SAMPLES and moves(command.values)
+        ]
         if not moving:
             return None
         start = max(float(command.t_s[0]) for command in moving)

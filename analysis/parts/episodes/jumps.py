@@ -144,10 +144,10 @@ def jumps_of(block: EpisodeBlock, regression: Regression, scale: JumpScale) -> J
         return Jumps.empty(block.episodes.size)
     jumps = _jumps(block, regression, residual=scale.residual)
     rates = windowed(block.states, RATE)
-    known = scale.usual > 0
+    usable = scale.usual > 0
     # In a signal that is scaled, noise is, too.
     scaled = np.maximum(np.abs(regression.deviations.gain) / (scale.gain + TINY), 1.0)
-    errors = np.where(known, (scale.usual * scaled) ** 2, np.inf)
+    errors = np.where(usable, (scale.usual * scaled) ** 2, np.inf)
     errors = errors + (scale.relative * rates) ** 2
     informing = rates * (scale.seen / errors)
     along = dot_joints(jumps, informing)

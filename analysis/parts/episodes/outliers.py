@@ -76,8 +76,8 @@ def outliers_of(
         np.take_along_axis(array, sound, axis=0) for array in (mean, limits, deviation)
     )
     size, half = values - middle - sound_mean * spread, limit * spread
-    known = np.isfinite(size) & (count >= ENOUGH_LIKE)
-    outside = known & (np.abs(size) > np.maximum(half, margins))
+    comparable = np.isfinite(size) & (count >= ENOUGH_LIKE)
+    outside = comparable & (np.abs(size) > np.maximum(half, margins))
     return Outliers(size, half, np.maximum(sd, TINY) * spread, outside)
 
 
@@ -105,8 +105,8 @@ def median_of(values: FloatArray) -> FloatArray:
     """Return the median of each column, 0 where nothing is known, shape (q,)."""
     if np.isfinite(values).all():
         return np.median(values, axis=0)
-    known = np.isfinite(values).any(axis=0)
-    return np.nan_to_num(np.nanmedian(np.where(known, values, 0.0), axis=0))
+    filled = np.isfinite(values).any(axis=0)
+    return np.nan_to_num(np.nanmedian(np.where(filled, values, 0.0), axis=0))
 
 
 def scatter_of(deviations: FloatArray, errors: FloatArray) -> FloatArray:

@@ -97,11 +97,11 @@ def _recursion(denominator: FloatArray, inputs: FloatArray, rest: float) -> Floa
         inputs: x, shape (n,).
         rest: y before the first.
     """
-    known = inputs.copy()
+    right_side = inputs.copy()
     for k in range(1, denominator.size):
-        known[:k] -= rest * denominator[k]
+        right_side[:k] -= rest * denominator[k]
     bands = np.repeat(denominator[:, np.newaxis], inputs.size, axis=1)
-    solution, _ = dtbtrs(bands, known, uplo="L", diag="U")  # never singular
+    solution, _ = dtbtrs(bands, right_side, uplo="L", diag="U")  # never singular
     return np.asarray(solution, dtype=np.float64).ravel()
 
 
