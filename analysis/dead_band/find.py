@@ -80,14 +80,14 @@ class Witness:
     def of(cls, columns: Columns, name: str, origin_ns: int) -> Witness:
         """Return a joint's motor current, or else its effort, which may be the gear's."""
         kinds = {key: columns.of(key) for key in _WITNESSES}
-        own = {key: signals[name] for key, signals in kinds.items() if name in signals}
-        found = clean_together(own, origin_ns)
-        known = (key for key in ("current", "effort") if key in found and found[key].count)
-        quantity = next(known, "")
-        return cls(found.get(quantity), quantity, found.get("reference"))
+        joint_signals = {key: signals[name] for key, signals in kinds.items() if name in signals}
+        series = clean_together(joint_signals, origin_ns)
+        usable = (key for key in ("current", "effort") if key in series and series[key].count)
+        quantity = next(usable, "")
+        return cls(series.get(quantity), quantity, series.get("reference"))
 
 
-def decide(cycles: WholeCycles, joint: int, one: FittedBand, witness: Witness) -> tuple[str, str]:
+def decide(cycles: WholeCycles, joint: int, band: FittedBand, witness: Witness) -> tuple[str, str]:
     """Tell stick from play, if the data do.
 
     A motor that dry friction holds pulls ever harder, from one direction to the other, while the
@@ -97,9 +97,9 @@ def decide(cycles: WholeCycles, joint: int, one: FittedBand, witness: Witness) -
         The kind, and what decides it.
     """
     fitted = slice(cycles.first, None)
-    times, rests = cycles.t_s[:, fitted], one.rests[:, fitted]
-    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, fitted]
-    across = (command - one.follower[:, fitted]) / max(float(one.parameters[WIDTH]) / 2, 1e-12)
+    times, rests = cycles.t_s[:, fitted], band.rests[:, fitted]
+    command = cycles.commanded(joint, float(band.parameters[DELAY]))[:, fitted]
+    across = (command - band.follower[:, fitted]) / max(float(band.parameters[WIDTH]) / 2, 1e-12)
     if witness.second is not None:
         along = _slopes(command, witness.second.at(times.ravel()).reshape(times.shape), rests)
         if along.size >= _FEW and float(along.mean()) > _ALONG and _sure(along):
@@ -110,7 +110,7 @@ def decide(cycles: WholeCycles, joint: int, one: FittedBand, witness: Witness) -
     moving = float(np.mean(np.abs(effort[~rests]))) if np.any(~rests) else 0.0
     if moving == 0:
         return EITHER, f"the {witness.quantity} is zero in motion"
-    signed, unsigned = (_slopes(one, effort, rests) / moving for one in (across, np.abs(across)))
+    signed, unsigned = (_slopes(over, effort, rests) / moving for over in (across, np.abs(across)))
     ramps = _sure(signed) and 2 * abs(float(signed.mean())) > _RAMP
     rises = _sure(unsigned) and float(unsigned.mean()) > _RAMP and float(effort.min()) >= 0
     if ramps or rises:
@@ -123,14 +123,14 @@ def decide(cycles: WholeCycles, joint: int, one: FittedBand, witness: Witness) -
 
 def _slopes(over: FloatArray, values: FloatArray, rests: BoolArray) -> FloatArray:
     """Slope of values over another quantity while the joint rests, a cycle each, shape (k,)."""
-    found: list[float] = []
+    slopes: list[float] = []
     for x, y, inside in zip(over, values, rests, strict=True):
         a, b = x[inside], y[inside]
         if a.size < _FEW or np.ptp(a) == 0:
             continue
-        own = a - a.mean()
-        found.append(float(own @ (b - b.mean()) / (own @ own)))
-    return np.array(found or [0.0])
+        centred = a - a.mean()
+        slopes.append(float(centred @ (b - b.mean()) / (centred @ centred)))
+    return np.array(slopes or [0.0])
 
 
 def _sure(values: FloatArray) -> bool:
@@ -154,25 +154,25 @@ def rested(command: FloatArray, width: float, top: float, bottom: float) -> Floa
         z [rad], shape (n,); with top = bottom = 0 the play operator of width w.
     """
     half = width / 2
-    found = np.empty_like(command)
+    follower = np.empty_like(command)
     if command.size == 0:
-        return found
+        return follower
     step = np.sign(np.diff(command))
     moving = np.flatnonzero(step)
     turn = moving[1:][step[moving[1:]] != step[moving[:-1]]]
     edges = np.concatenate(([0], turn, [command.size - 1]))  # first and last of each way
     state = float(command[0])
-    found[0] = state
+    follower[0] = state
     for i, j in pairwise(edges.tolist()):
         part = command[i + 1 : j + 1]
         if part.size == 0:
             continue
         if part[-1] >= command[i]:
-            found[i + 1 : j + 1] = np.where(part - state > half + bottom, part - half, state)
+            follower[i + 1 : j + 1] = np.where(part - state > half + bottom, part - half, state)
         else:
-            found[i + 1 : j + 1] = np.where(state - part > half + top, part + half, state)
-        state = float(found[j])
-    return found
+            follower[i + 1 : j + 1] = np.where(state - part > half + top, part + half, state)
+        state = float(follower[j])
+    return follower
 
 
 def fundamental_change(
@@ -220,11 +220,11 @@ def dead_bands(
     measured = [responses[name] for name in names]
     bands: dict[str, DeadBand] = {}
     for group in shared_times(measured):
-        own = [names[i] for i in group]
-        both = [commands[name] for name in own], [responses[name] for name in own]
+        members = [names[i] for i in group]
+        both = [commands[name] for name in members], [responses[name] for name in members]
         cycles = whole_cycles(*both, gait.fit.omega, MOST_CYCLES)
         if cycles is not None:
-            bands |= _of_group(own, cycles, gait.fit.omega, columns, origin_ns)
+            bands |= _of_group(members, cycles, gait.fit.omega, columns, origin_ns)
     return bands
 
 
@@ -233,7 +233,7 @@ def _of_group(
 ) -> dict[str, DeadBand]:
     wave, ratio = _fundamentals(cycles, omega)
     amplitude, lag = np.abs(wave), -np.angle(ratio) % (2 * np.pi)
-    resolution = np.array([resolution_of(one) for one in cycles.measured])
+    resolution = np.array([resolution_of(angles) for angles in cycles.measured])
     linear = np.array([_without(cycles, j, float(lag[j]), omega) for j in range(len(names))])
     hinted = (
         (np.abs(ratio) > _FOLLOWS)
@@ -248,17 +248,17 @@ def _of_group(
     part = WholeCycles(some, cycles.t_s, cycles.first, cycles.measured[chosen])
     fits = fit_dead_bands(part, omega, amplitude[chosen], lag[chosen], resolution[chosen])
     bands: dict[str, DeadBand] = {}
-    for k, (j, one) in enumerate(zip(chosen.tolist(), fits, strict=True)):
-        least = RESOLVED * resolution[j] / abs(one.gain) if one.gain else np.inf
-        clearer = one.independent * np.log(linear[j, 0] / one.cost)
-        shown = one.gain > 0 and clearer >= _CLEAR and not np.any(one.travel[:, 0] < least)
-        if not shown or np.any(one.travel[:, 1] <= 0):
+    for k, (j, fit) in enumerate(zip(chosen.tolist(), fits, strict=True)):
+        least = RESOLVED * resolution[j] / abs(fit.gain) if fit.gain else np.inf
+        clearer = fit.independent * np.log(linear[j, 0] / fit.cost)
+        shown = fit.gain > 0 and clearer >= _CLEAR and not np.any(fit.travel[:, 0] < least)
+        if not shown or np.any(fit.travel[:, 1] <= 0):
             continue
-        rest_s = _rests(part, k, one, float(resolution[j]))
+        rest_s = _rests(part, k, fit, float(resolution[j]))
         if rest_s is not None:
-            kind = decide(part, k, one, Witness.of(columns, names[j], origin_ns))
+            kind = decide(part, k, fit, Witness.of(columns, names[j], origin_ns))
             bands[names[j]] = _result(
-                one, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
+                fit, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
             )
     return bands
 
@@ -317,7 +317,7 @@ def _rests(
     begin = cycles.first // 2  # by then the model has its state
     command = cycles.commanded(joint, float(fitted.parameters[DELAY]))[:, begin:]
     middle = float(fitted.follower.mean())
-    found: tuple[list[float], list[float]] = ([], [])
+    durations: tuple[list[float], list[float]] = ([], [])
     crept: tuple[list[float], list[float]] = ([], [])
     led: tuple[list[float], list[float]] = ([], [])
     for rests, z, c, seen in zip(
@@ -331,19 +331,19 @@ def _rests(
             if i == 0 or k == rests.size or k - i < _SHORTEST:
                 continue  # begins before the stretch or ends after it
             side = int(z[i] < middle)
-            found[side].append(float(k - i) * cycles.period_s)
+            durations[side].append(float(k - i) * cycles.period_s)
             settled = slice(i + round(_SETTLING * (k - i)), k)
             parts = np.array_split(seen[settled], 3 if k - i >= _LONG else 2)
             means = [float(part.mean()) for part in parts]
             crept[side].append(max(means) - min(means))
             led[side].append(abs(fitted.gain) * float(np.ptp(c[settled])))
     for side in (0, 1):
-        if not found[side]:
+        if not durations[side]:
             return None
         allowed = max(resolution, _CREEP * float(np.median(led[side])))
         if float(np.median(crept[side])) > allowed:
             return None
-    return float(np.median(found[0])), float(np.median(found[1]))
+    return float(np.median(durations[0])), float(np.median(durations[1]))
 
 
 def _result(

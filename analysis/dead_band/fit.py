@@ -93,8 +93,8 @@ def fit_dead_bands(
     joints = np.arange(len(amplitude), dtype=np.int64)
     scales = _Scales(cycles.period_s, omega, amplitude, resolution)
     starts = _starts(cycles.period_s, omega, amplitude, lag)
-    each = misfit(cycles.some(5), np.repeat(joints, starts.shape[1]), starts.reshape(-1, 5))
-    first = starts[joints, each.cost.reshape(starts.shape[:2]).argmin(axis=1)]
+    misfits = misfit(cycles.some(5), np.repeat(joints, starts.shape[1]), starts.reshape(-1, 5))
+    first = starts[joints, misfits.cost.reshape(starts.shape[:2]).argmin(axis=1)]
     # The profile over b: d, T and w are fitted, b is a share of w.
     rows = np.repeat(joints, _SHARES.size)
     ties = np.zeros((rows.size, PARAMETERS, 3))
@@ -106,28 +106,28 @@ def fit_dead_bands(
     profile = np.einsum("rpn,rn->rp", ties, values)
     costs = misfit(cycles, rows, profile).cost.reshape(joints.size, -1)
     profile = profile.reshape(joints.size, -1, PARAMETERS)
-    found = [
+    candidates = [
         _Candidates(profile[j], [_Candidate(profile[j, 0], _TIES[0])], costs[j]) for j in joints
     ]
     # b of its own, the same at both ends; then one at each.
     start = profile[joints, 1 + costs[:, 1:].argmin(axis=1)]
     for tie in _TIES[1:]:
         n = tie.shape[1]
-        own = _levenberg(
+        fitted = _levenberg(
             cycles, joints, start[:, :n], np.broadcast_to(tie, (joints.size, *tie.shape)), scales
         )
-        start = own @ tie.T
-        for one, parameters in zip(found, start, strict=True):
-            one.fits.append(_Candidate(parameters, tie))
+        start = fitted @ tie.T
+        for candidate, parameters in zip(candidates, start, strict=True):
+            candidate.fits.append(_Candidate(parameters, tie))
     # All joints in step here, too: a call takes as long for one as for many.
     lefts = [
-        misfit(cycles, joints, np.array([one.fits[k].parameters for one in found]))
+        misfit(cycles, joints, np.array([candidate.fits[k].parameters for candidate in candidates]))
         for k in range(len(_TIES))
     ]
-    moved = _moved(cycles, joints.tolist(), [one.fits[0] for one in found], scales)
+    moved = _moved(cycles, joints.tolist(), [candidate.fits[0] for candidate in candidates], scales)
     return [
-        _chosen(cycles, j, one, scales, lefts=[left.row(j) for left in lefts], moved=moved[j])
-        for j, one in enumerate(found)
+        _chosen(cycles, j, candidate, scales, lefts=[left.row(j) for left in lefts], moved=moved[j])
+        for j, candidate in enumerate(candidates)
     ]
 
 
@@ -203,12 +203,12 @@ class _Scales:
     def __init__(
         self, period_s: float, omega: float, amplitude: FloatArray, resolution: FloatArray
     ) -> None:
-        one = np.ones_like(amplitude)
+        ones = np.ones_like(amplitude)
         fine = np.maximum(resolution / 8, 5e-4 * amplitude)
         coarse = np.maximum(resolution, 0.01 * amplitude)
-        self.unit = np.stack([one / omega, one / omega, *[2 * amplitude] * 3], axis=1)
-        self.nudge = np.stack([one * period_s / 20] * 2 + [fine] * 3, axis=1)
-        self.least_move = np.stack([one * period_s / 2] * 2 + [coarse] * 3, axis=1)
+        self.unit = np.stack([ones / omega, ones / omega, *[2 * amplitude] * 3], axis=1)
+        self.nudge = np.stack([ones * period_s / 20] * 2 + [fine] * 3, axis=1)
+        self.least_move = np.stack([ones * period_s / 2] * 2 + [coarse] * 3, axis=1)
         self.lower = np.array([-period_s / 2, period_s / 10, 0.0, 0.0, 0.0])
         self.resolution = resolution
 
@@ -220,14 +220,14 @@ def _starts(period_s: float, omega: float, amplitude: FloatArray, lag: FloatArra
         # Describing function of the play operator (Gelb and Vander Velde 1968): its lag.
         across = 1 - 2 * share
         inphase = 0.5 + (np.arcsin(across) + across * np.sqrt(1 - across**2)) / np.pi
-        own = np.arctan2((1 - across**2) / np.pi, inphase)
-        rest_s = np.maximum(lag - own, 0.0) / omega
+        band_lag = np.arctan2((1 - across**2) / np.pi, inphase)
+        rest_s = np.maximum(lag - band_lag, 0.0) / omega
         for part in _LAGS:
             follower_s = np.maximum(part * rest_s, period_s / 4)
-            one = np.zeros((amplitude.size, PARAMETERS))
-            one[:, DELAY], one[:, LAG] = (1 - part) * rest_s, follower_s
-            one[:, WIDTH] = 2 * share * amplitude
-            sets.append(one)
+            parameters = np.zeros((amplitude.size, PARAMETERS))
+            parameters[:, DELAY], parameters[:, LAG] = (1 - part) * rest_s, follower_s
+            parameters[:, WIDTH] = 2 * share * amplitude
+            sets.append(parameters)
     return np.stack(sets, axis=1)
 
 
@@ -263,8 +263,8 @@ def _levenberg(
                 step /= max(1.0, float(np.max(np.abs(step) / most)))
                 tried[r, m] = np.maximum(values[r] + step, lower)
         full = np.einsum("rpn,rmn->rmp", ties[active], tried[active]).reshape(-1, PARAMETERS)
-        each = misfit(cycles, np.repeat(joint[active], _FACTORS.size), full)
-        costs = each.cost.reshape(active.size, -1)
+        misfits = misfit(cycles, np.repeat(joint[active], _FACTORS.size), full)
+        costs = misfits.cost.reshape(active.size, -1)
         best = costs.argmin(axis=1)
         here = np.arange(active.size, dtype=np.int64)
         before = np.square(left[active]).sum(axis=(1, 2))
@@ -277,7 +277,7 @@ def _levenberg(
             break
         moved = active[better]
         values[moved] = tried[moved, best[better]]
-        left[moved] = each.residual[(_FACTORS.size * here + best)[better]]
+        left[moved] = misfits.residual[(_FACTORS.size * here + best)[better]]
     return values
 
 
@@ -306,11 +306,11 @@ def _slopes(
 
 def _independent(residual: FloatArray) -> float:
     """How many independent residuals there are, from their correlation along and across cycles."""
-    own: FloatArray = residual - residual.mean()
-    square = _mean(own**2)
+    centred: FloatArray = residual - residual.mean()
+    square = _mean(centred**2)
     if square == 0:
         return float(residual.size)
-    along = max(0.0, _mean(own[:, 1:] * own[:, :-1]) / square)
+    along = max(0.0, _mean(centred[:, 1:] * centred[:, :-1]) / square)
     share = _mean(residual.mean(axis=0) ** 2) / square * _repeated(residual)
     cycles, samples = residual.shape
     return samples * (1 - along) / (1 + along) / (share + (1 - share) / cycles)
@@ -359,8 +359,8 @@ def _moved(
     if not any(counts):
         return [np.empty((0, *cycles.t_s[:, cycles.first :].shape)) for _ in joints]
     rows = np.repeat(np.array(joints, dtype=np.int64), counts)
-    found = misfit(cycles, rows, np.concatenate(sets)).follower[:, :, cycles.first :]
-    return np.split(found, np.cumsum(counts)[:-1])
+    followers = misfit(cycles, rows, np.concatenate(sets)).follower[:, :, cycles.first :]
+    return np.split(followers, np.cumsum(counts)[:-1])
 
 
 def _errors(
@@ -368,7 +368,7 @@ def _errors(
     joint: int,
     fitted: _Candidate,
     scales: _Scales,
-    one: BandMisfit,
+    band_misfit: BandMisfit,
     *,
     nudged: FloatArray,
 ) -> FloatArray:
@@ -381,13 +381,13 @@ def _errors(
     n = tie.shape[1]
     nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
     free = _free(fitted, scales)
-    still = one.follower[0, :, cycles.first :]
+    still = band_misfit.follower[0, :, cycles.first :]
     moved = nudged - still
-    gain = float(one.gain[0])
+    gain = float(band_misfit.gain[0])
     z: FloatArray = still - still.mean()
     columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]
     design = np.stack([*columns, z, np.full_like(z, _mean(z**2) ** 0.5)])
-    residual = one.residual[0]
+    residual = band_misfit.residual[0]
     count, samples = residual.shape
     within = np.einsum("akn,bkn->kab", design, design)
     spread = _jackknife(within, np.einsum("akn,kn->ka", design, residual))
@@ -403,10 +403,10 @@ def _errors(
     into = tie[:, free]
     covariance += into @ inner @ into.T
     covariance[WIDTH, WIDTH] += (scales.resolution[joint] / max(gain, 0.1)) ** 2 / 12
-    wanted = np.zeros((4, PARAMETERS))
-    wanted[:2, WIDTH] = 1.0
-    wanted[[0, 2], TOP] = wanted[[1, 3], BOTTOM] = 1.0
-    variance = np.einsum("ap,pq,aq->a", wanted, covariance, wanted)
+    selection = np.zeros((4, PARAMETERS))
+    selection[:2, WIDTH] = 1.0
+    selection[[0, 2], TOP] = selection[[1, 3], BOTTOM] = 1.0
+    variance = np.einsum("ap,pq,aq->a", selection, covariance, selection)
     return t_factor(min(count - 1, _SEGMENTS - PARAMETERS)) * np.sqrt(variance)
 
 

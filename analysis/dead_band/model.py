@@ -66,8 +66,8 @@ def follow(
     modes = np.stack((down, rest, (half, -half - limits[0], never)))
     present = modes[1].copy()
     pull, least, most = present
-    found, moves = np.empty_like(u), np.zeros(u.shape, dtype=np.bool_)
-    found[0] = v = u[0].copy()
+    follower, moves = np.empty_like(u), np.zeros(u.shape, dtype=np.bool_)
+    follower[0] = v = u[0].copy()
     mode, after, change = np.zeros_like(half), np.empty_like(half), np.empty_like(half)
     above, goes = np.empty_like(moves[0]), np.zeros_like(moves[0])
     for k in range(1, samples):
@@ -81,7 +81,7 @@ def follow(
         if np.count_nonzero(moved):  # some start
             i = moved.nonzero()[0]
             way = above[i].astype(np.int64)
-            sign, z, to, step = 2.0 * way - 1.0, found[k - 1][i], now[i], dt[k][i]
+            sign, z, to, step = 2.0 * way - 1.0, follower[k - 1][i], now[i], dt[k][i]
             mode[i], goes[i], present[:, i] = sign, True, modes[2 * way, :, i].T
             slope, past = (to - u[k - 1][i]) / step, sign * (to - z) - limits[way, i]
             moves_s = np.minimum(past / np.maximum(np.abs(slope), _TINY), step)
@@ -94,10 +94,10 @@ def follow(
         np.copyto(v, after, where=moved)
         if np.count_nonzero(moved) < np.count_nonzero(goes):  # some stop
             i = np.greater(goes, moved).nonzero()[0]
-            v[i], mode[i], goes[i], present[:, i] = found[k - 1][i], 0.0, False, modes[1][:, i]
-        np.subtract(v, pull, out=found[k])
+            v[i], mode[i], goes[i], present[:, i] = follower[k - 1][i], 0.0, False, modes[1][:, i]
+        np.subtract(v, pull, out=follower[k])
     shape = (samples, rows, stretches)
-    return np.moveaxis(found.reshape(shape), 0, 2), np.moveaxis(~moves.reshape(shape), 0, 2)
+    return np.moveaxis(follower.reshape(shape), 0, 2), np.moveaxis(~moves.reshape(shape), 0, 2)
 
 
 def _low_pass(u: FloatArray, step_s: FloatArray, lag: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -108,8 +108,8 @@ def _low_pass(u: FloatArray, step_s: FloatArray, lag: FloatArray) -> tuple[Float
         step_s: As in :func:`follow`.
         lag: T of the rows [s], shape (r,).
     """
-    known, row = np.unique(lag, return_inverse=True)  # many rows share it
-    ratio = known[:, np.newaxis] / step_s.T[:, np.newaxis]
+    lags, row = np.unique(lag, return_inverse=True)  # many rows share it
+    ratio = lags[:, np.newaxis] / step_s.T[:, np.newaxis]
     keeps = np.exp(-1 / ratio)
     a, behind = (x[:, row].reshape(u.shape) for x in (keeps, ratio * (1 - keeps)))
     before = np.concatenate((u[:1], u[:-1]))
@@ -209,8 +209,10 @@ class BandMisfit:
 
     def row(self, index: int) -> BandMisfit:
         """Return one of the rows, alone."""
-        own = slice(index, index + 1)
-        return BandMisfit(self.residual[own], self.gain[own], self.follower[own], self.rests[own])
+        rows = slice(index, index + 1)
+        return BandMisfit(
+            self.residual[rows], self.gain[rows], self.follower[rows], self.rests[rows]
+        )
 
 
 def misfit(cycles: WholeCycles, joint: IntArray, parameters: FloatArray) -> BandMisfit:
@@ -224,16 +226,16 @@ def misfit(cycles: WholeCycles, joint: IntArray, parameters: FloatArray) -> Band
         One row a set of parameters.
     """
     pairs, row = np.unique(np.stack((joint, parameters[:, DELAY])), axis=1, return_inverse=True)
-    known = np.stack([cycles.commanded(int(j), float(d)) for j, d in pairs.T])
-    u = known[row]
+    commands = np.stack([cycles.commanded(int(j), float(d)) for j, d in pairs.T])
+    u = commands[row]
     z, rests = follow(u, cycles.step_s, parameters)
     fitted, measured = z[:, :, cycles.first :], cycles.measured[joint, :, cycles.first :]
-    own = fitted - fitted.mean(axis=(1, 2), keepdims=True)
+    centred = fitted - fitted.mean(axis=(1, 2), keepdims=True)
     seen = measured - measured.mean(axis=(1, 2), keepdims=True)
-    square = np.square(own).sum(axis=(1, 2))
-    product = (own * seen).sum(axis=(1, 2))
+    square = np.square(centred).sum(axis=(1, 2))
+    product = (centred * seen).sum(axis=(1, 2))
     gain = np.divide(product, square, out=np.zeros_like(square), where=square > 0)
-    return BandMisfit(seen - gain[:, np.newaxis, np.newaxis] * own, gain, z, rests)
+    return BandMisfit(seen - gain[:, np.newaxis, np.newaxis] * centred, gain, z, rests)
 
 
 def _spread(index: IntArray, most: int) -> IntArray:
