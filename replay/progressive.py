@@ -285,7 +285,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     """Draw a session in one recording."""
     session = task.session
     clock = clock_of(session)
-    parts = stretches(session, found.wanted, found.context_ns)
+    parts = stretches(session, found.topics, found.context_ns)
     first = next(parts)
     rec = sink.open(identity)
     send_properties(rec, session.session_id, session.start_ns)
@@ -381,7 +381,7 @@ def _require_nothing_else(session: SessionView, found: Survey) -> None:
     """Look for fields that begin after all that a brief survey saw."""
     for topic, fields in wanted_fields(session).items():
         for one in fields if topic != GAIT else ():
-            if one not in found.wanted.get(topic, ()) and comes(session, topic, one):
+            if one not in found.topics.get(topic, ()) and comes(session, topic, one):
                 raise _UnforeseenError(f"{topic} ({one})")
 
 

@@ -101,7 +101,7 @@ def write_recording(
         averaged = Averaged(clock, analysis)
         drawing = RerunDrawing(rec, clock, sources, layer.named, averaged=averaged)
         session.forget()
-        for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
+        for stretch in stretches(session, sources.survey.topics, sources.survey.context_ns):
             drawing.write(stretch)
             rec.flush()  # what is drawn is written before more is read
         drawing.write_response(layer)

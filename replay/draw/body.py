@@ -117,9 +117,9 @@ def log_poses(
     spread = np.broadcast_to(colors, (*centre.shape[:2], 4))
     for i in np.flatnonzero(meshed(robot)):
         pose = np.concatenate([centre[:, i], quaternion[:, i]], axis=-1)
-        known = np.isfinite(pose).all(axis=-1)
-        pose[~known] = _NOWHERE
-        scale = np.where(known, robot.links[i].mesh_scale, 0.0)  # of no size where unknown
+        finite = np.isfinite(pose).all(axis=-1)
+        pose[~finite] = _NOWHERE
+        scale = np.where(finite, robot.links[i].mesh_scale, 0.0)  # of no size where unknown
         rec.send_columns(
             f"{MESHES}/{robot.links[i].name}",
             times,
@@ -144,12 +144,12 @@ def power_colors(power_w: FloatArray, limit_w: float) -> NDArray[np.uint8]:
     Returns:
         sRGB and opacity, shape (..., 4); dark grey where the power isn't known.
     """
-    known = np.isfinite(power_w)
-    share = np.clip(np.where(known, power_w, 0.0) / limit_w, -1.0, 1.0)[..., None]
+    finite = np.isfinite(power_w)
+    share = np.clip(np.where(finite, power_w, 0.0) / limit_w, -1.0, 1.0)[..., None]
     end = np.where(share < 0.0, _DRIVEN, _DRIVES)
     colors = np.full((*power_w.shape, 4), 255, dtype=np.uint8)
     colors[..., :3] = np.round(_IDLE + np.abs(share) * (end - _IDLE))
-    colors[~known] = _UNKNOWN
+    colors[~finite] = _UNKNOWN
     return colors
 
 
@@ -219,15 +219,15 @@ def capsule_columns(
         Columns of n rows with at most m + 1 capsules each.
     """
     origin, quaternion = poses
-    known = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1) & drawn
+    visible = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1) & drawn
     length, radius = capsule_shape(robot)
     return rr.Capsules3D.columns(
-        lengths=np.broadcast_to(length, known.shape)[known],
-        radii=np.broadcast_to(radius, known.shape)[known],
-        translations=origin[known],
-        quaternions=quaternion[known],
-        colors=np.broadcast_to(colors, (*known.shape, 4))[known],
-    ).partition(np.count_nonzero(known, axis=1))
+        lengths=np.broadcast_to(length, visible.shape)[visible],
+        radii=np.broadcast_to(radius, visible.shape)[visible],
+        translations=origin[visible],
+        quaternions=quaternion[visible],
+        colors=np.broadcast_to(colors, (*visible.shape, 4))[visible],
+    ).partition(np.count_nonzero(visible, axis=1))
 
 
 def log_body(
@@ -372,8 +372,8 @@ def _known_points(
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Points above joints whose pose is known: where, how many a row, and of which joint."""
     point = above_joints(motion.robot, names, *motion.links(rows))
-    known = np.isfinite(point).all(axis=-1)
-    return point[known], np.count_nonzero(known, axis=1), np.nonzero(known)[1]
+    finite = np.isfinite(point).all(axis=-1)
+    return point[finite], np.count_nonzero(finite, axis=1), np.nonzero(finite)[1]
 
 
 def log_marks(
@@ -389,13 +389,13 @@ def log_marks(
         names: The joints; those that the robot doesn't have are left out.
         chosen: Which of its drawing times, shape (n,).
     """
-    known = tuple(name for name in names if name in motion.robot.joint_names)
-    if not known:
+    joints = tuple(name for name in names if name in motion.robot.joint_names)
+    if not joints:
         return
     look = rr.Points3D.from_fields(colors=NAMED, radii=rr.Radius.ui_points(5.0), show_labels=True)
     rec.log(MARKS, look, static=True)
     for part, times in clock.rows(motion.t_ns[chosen]):
-        point, count, which = _known_points(motion, known, chosen[part])
-        labels: list[str] = [known[i] for i in which.tolist()]
+        point, count, which = _known_points(motion, joints, chosen[part])
+        labels: list[str] = [joints[i] for i in which.tolist()]
         dots = rr.Points3D.columns(positions=point.astype(np.float32), labels=labels)
         rec.send_columns(MARKS, times, dots.partition(count))

@@ -98,7 +98,7 @@ def markdown(
         *([f"recorded by undulog {escaped(recorded)}"] if recorded else []),
     )
     awaited_text = "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
-    joints = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
+    joints = ", ".join(f"{escaped(module.joint)} ({escaped(module.why)})" for module in named)
     return document(
         [
             f"**{escaped(awaited_text if analysis is None else analysis.answer.sentence)}**",
@@ -182,40 +182,40 @@ class Sources:
     """
 
     session: SessionView
-    found: Survey
+    survey: Survey
     warnings: list[str]
 
     @classmethod
-    def of(cls, session: SessionView, found: Survey | None = None) -> Sources:
+    def of(cls, session: SessionView, surveyed: Survey | None = None) -> Sources:
         """Survey a session.
 
         Args:
-            found: What it holds, where that is known; None to go through it.
+            surveyed: What it holds, where that is known; None to go through it.
 
         Raises:
             DataError: If the session holds nothing that can be drawn.
         """
         if not any(channel.count for channel in session.channels.values()):
             raise DataError(f"{session.path}: the session holds no messages; nothing can be drawn")
-        found = survey(session, BODY_RATE_HZ) if found is None else found
+        surveyed = survey(session, BODY_RATE_HZ) if surveyed is None else surveyed
         missing: list[str] = []
         if session.robot is None:
             missing.append("no robot description in the session: the body can't be drawn")
-        if entities.MEASURED not in found.samples:
+        if entities.MEASURED not in surveyed.samples:
             missing.append("no measured joint angles on /joint_states")
         if left_out := drawn_topics(session)[1]:
             missing.append(f"{left_out} more joint topics are not shown")
-        return cls(session, found, missing)
+        return cls(session, surveyed, missing)
 
     @property
     def measured(self) -> tuple[Track, ...]:
         """Some samples of each measured angle [rad]."""
-        return self.found.samples.get(entities.MEASURED, ())
+        return self.survey.samples.get(entities.MEASURED, ())
 
     @property
     def commanded(self) -> tuple[Track, ...]:
         """Some samples of each commanded angle [rad]."""
-        return self.found.samples.get(entities.COMMANDED, ())
+        return self.survey.samples.get(entities.COMMANDED, ())
 
 
 def clock_of(session: SessionView) -> TimeColumns:
@@ -253,15 +253,15 @@ class RerunDrawing:
                 further before :meth:`widen`.
         """
         self._rec, self._clock, self._sources = rec, clock, sources
-        self._named = [one.joint for one in named]
+        self._named = [module.joint for module in named]
         self._averaged = averaged
         robot = sources.session.robot
         moving = sources.measured or sources.commanded
         self._palette = palette_of(robot, [track.name for track in moving])
         self._places = lines.head_middle_tail(robot, sources.commanded or sources.measured)
-        found = sources.found
+        surveyed = sources.survey
         self._plots = Plots(
-            rec, clock, found.parts, self._places, self._palette, samples=found.samples
+            rec, clock, surveyed.parts, self._places, self._palette, samples=surveyed.samples
         )
         self._head, self._scene = self._open_scene(span)
         self.content = self._written()
@@ -270,7 +270,7 @@ class RerunDrawing:
     @property
     def limit_w(self) -> float | None:
         """Power at which a segment's colour is full [W]; None where no body is drawn."""
-        return None if self._head is None else self._sources.found.power_limit_w
+        return None if self._head is None else self._sources.survey.power_limit_w
 
     def write(self, stretch: SpanSamples) -> None:
         """Draw a stretch."""
@@ -283,13 +283,13 @@ class RerunDrawing:
         if self._scene is not None:
             self._scene.write(stretch)
 
-    def widen(self, found: Survey, span: DrawnSpan) -> None:
+    def widen(self, surveyed: Survey, span: DrawnSpan) -> None:
         """Continue with a further part of a session whose beginning is drawn.
 
         Args:
             span: The part of the head's trail that isn't drawn yet.
         """
-        self._sources = replace(self._sources, found=found)
+        self._sources = replace(self._sources, survey=surveyed)
         self._head, self._scene = self._open_scene(span)
 
     def write_words(self) -> None:
@@ -315,13 +315,13 @@ class RerunDrawing:
         analysis = layer.analysis
         if analysis is None:
             return
-        found = charts(analysis)
+        bar_charts = charts(analysis)
         tables = cycle_tables(analysis, layer.steady)
         maps = heat_maps(analysis, tables, tuple(self._palette))
-        log_charts(self._rec, found, self._palette, self._named)
-        log_current(self._rec, self._clock, found, tables)
+        log_charts(self._rec, bar_charts, self._palette, self._named)
+        log_current(self._rec, self._clock, bar_charts, tables)
         log_maps(self._rec, self._clock, maps, self._named)
-        self.content = replace(self.content, charts=found, maps=maps)
+        self.content = replace(self.content, charts=bar_charts, maps=maps)
 
     def write_cycles(self, layer: Layer) -> None:
         """Write values by cycle, and the mean of all cycles.
@@ -333,7 +333,7 @@ class RerunDrawing:
         tables = cycle_tables(analysis, layer.steady) if analysis is not None else ()
         cycles = log_cycles(self._rec, self._clock, tables, self._palette)
         if self._averaged is None:
-            averaged = Averaged(self._clock, analysis).read(sources.session, sources.found.wanted)
+            averaged = Averaged(self._clock, analysis).read(sources.session, sources.survey.topics)
         else:
             averaged = self._averaged.kept
         mean = log_mean_cycle(
@@ -396,11 +396,11 @@ class RerunDrawing:
         robot, measured = sources.session.robot, sources.measured
         if robot is None or not measured:
             return None, None
-        times = Track(measured[0].name, sources.found.drawing_ns, np.zeros(0))
+        times = Track(measured[0].name, sources.survey.drawing_ns, np.zeros(0))
         session = sources.session.view(stop_ns=span.known_ns)
         head = read_head(session, robot, [times], sources.warnings)
-        known = {one.name for one in measured}
-        if missing := [name for name in robot.joint_names if name not in known]:
+        names = {track.name for track in measured}
+        if missing := [name for name in robot.joint_names if name not in names]:
             sources.warnings.append(
                 f"no angles of {', '.join(missing)}: the body is drawn up to the first of these"
             )
@@ -410,7 +410,7 @@ class RerunDrawing:
             session,
             robot,
             head,
-            look=self._look(sources.found.power_limit_w),
+            look=self._look(sources.survey.power_limit_w),
             warnings=sources.warnings,
             span=span,
         )
@@ -441,10 +441,10 @@ def start_of(head: HeadPath) -> InitialPose | None:
     Returns:
         Its first known pose, or None where none is known.
     """
-    known = np.flatnonzero(np.isfinite(head.position).all(axis=1))
-    if not known.size:
+    placed = np.flatnonzero(np.isfinite(head.position).all(axis=1))
+    if not placed.size:
         return None
-    x, y, z = head.position[known[0]].tolist()
-    forward = rotation_from_quaternion(head.quaternion[known[0]])[:, 0]
+    x, y, z = head.position[placed[0]].tolist()
+    forward = rotation_from_quaternion(head.quaternion[placed[0]])[:, 0]
     heading = float(np.arctan2(forward[1], forward[0]))
     return InitialPose((x, y, z), heading if np.isfinite(heading) else 0.0)

@@ -118,11 +118,11 @@ class MeanCycles:
         Returns:
             Shape (p, number of names); NaN columns where there is no such channel.
         """
-        found = np.full((DEGREES.size, len(names)), np.nan)
+        columns = np.full((DEGREES.size, len(names)), np.nan)
         for i, name in enumerate(names):
             if name in self.names:
-                found[:, i] = self.of(name)[0]
-        return found
+                columns[:, i] = self.of(name)[0]
+        return columns
 
 
 def pace_of(
@@ -181,7 +181,9 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
     """
     artefacts = () if analysis is None else analysis.artefacts
     false = (artefact for artefact in artefacts if artefact.falsifies("position"))
-    return tuple(dict.fromkeys(one.joint for one in false if one.within(start_s, stop_s)))
+    return tuple(
+        dict.fromkeys(artefact.joint for artefact in false if artefact.within(start_s, stop_s))
+    )
 
 
 def mean_cycles(tracks: Sequence[Track], pace: CyclePhase) -> MeanCycles | None:
@@ -221,10 +223,10 @@ def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray
     """
     still = np.zeros((len(angles), 3)), np.tile(np.eye(3), (len(angles), 1, 1))
     centre, rotation = link_poses(robot, *still, angles)
-    known = np.isfinite(centre[..., 0])
-    many = np.count_nonzero(known, axis=1)[:, None]
-    middle = np.where(known[..., None], centre, 0.0).sum(axis=1) / many
-    u, _, vt = np.linalg.svd(np.where(known[..., None, None], rotation, 0.0).sum(axis=1))
+    finite = np.isfinite(centre[..., 0])
+    many = np.count_nonzero(finite, axis=1)[:, None]
+    middle = np.where(finite[..., None], centre, 0.0).sum(axis=1) / many
+    u, _, vt = np.linalg.svd(np.where(finite[..., None, None], rotation, 0.0).sum(axis=1))
     # Det of U V^T is +1 or -1: only the former is a rotation.
     sign = np.ones((len(angles), 3))
     sign[:, 2] = np.linalg.det(u @ vt)
@@ -248,7 +250,7 @@ def _fitted(
     start_ns: int,
 ) -> CyclePhase | None:
     """Return the phase of a fitted rhythm: 0 at the crest of the first joint's command."""
-    track = next((one for one in commanded if one.name == places.names[0]), None)
+    track = next((track for track in commanded if track.name == places.names[0]), None)
     cycles = (window[1] - window[0]) * frequency_hz
     if track is None or not cycles <= track.t_ns.size:  # a saved result may say anything
         return None
@@ -267,9 +269,9 @@ def _fitted(
 def _cut(track: Track, pace: CyclePhase) -> FloatArray:
     """Return a channel's whole cycles, shape (c, ``PHASES``)."""
     phase = interpolate(pace.t_ns, pace.phase_rad, track.t_ns)
-    known: BoolArray = np.isfinite(phase) & np.isfinite(track.values)
-    phase, values = phase[known], track.values[known]
-    first = np.append(True, np.diff(phase) > 0) if phase.size else known[:0]
+    finite: BoolArray = np.isfinite(phase) & np.isfinite(track.values)
+    phase, values = phase[finite], track.values[finite]
+    first = np.append(True, np.diff(phase) > 0) if phase.size else finite[:0]
     series = Series(track.name, phase[first], values[first])
     nothing = np.zeros((0, PHASES))
     if series.count < 3:

@@ -89,14 +89,14 @@ def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:
         sRGB, shape (c, m, 3).
     """
     value = shown.table.value.T
-    known = np.isfinite(value)
-    filled = np.where(known, value, shown.low)
+    finite = np.isfinite(value)
+    filled = np.where(finite, value, shown.low)
     if shown.signed:
         colors = power_colors(filled, shown.high)[..., :3]
     else:
         share = np.clip((filled - shown.low) / (shown.high - shown.low), 0.0, 1.0)
         colors = joint_colors(256)[np.rint(255.0 * share).astype(np.int64), :3]
-    return np.where(known[..., None], colors, np.array(_NOTHING, dtype=np.uint8))
+    return np.where(finite[..., None], colors, np.array(_NOTHING, dtype=np.uint8))
 
 
 def log_maps(

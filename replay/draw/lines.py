@@ -82,7 +82,7 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> BodyPlaces
     if robot is None:
         names, plane = tuple(swing), None
     else:
-        planes = {one: [j.name for j in robot.joints if j.plane is one] for one in Plane}
+        planes = {plane: [j.name for j in robot.joints if j.plane is plane] for plane in Plane}
         plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
         names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
     return BodyPlaces(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
@@ -94,10 +94,10 @@ def places_look(places: BodyPlaces, kind: str) -> dict[str, Any]:
     Args:
         kind: ``measured`` or ``commanded``.
     """
-    own = kind == "measured"
+    measured = kind == "measured"
     labels = places.labelled.items()
-    titles = {name: line_title(name, label if own else "command") for name, label in labels}
-    return {"titles": titles, "width": 2.0 if own else 1.0}
+    titles = {name: line_title(name, label if measured else "command") for name, label in labels}
+    return {"titles": titles, "width": 2.0 if measured else 1.0}
 
 
 def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
@@ -193,15 +193,15 @@ def rhythm_of(gait: Sequence[Track]) -> LoggedRhythm | None:
         The rhythm, or None where there is no phase or none advances by a whole cycle.
     """
     by_name = {track.name: track for track in gait}
-    found: list[tuple[float, LoggedRhythm]] = []
+    rhythms: list[tuple[float, LoggedRhythm]] = []
     for name, track in by_name.items():
         if name.endswith(".phase"):
             rhythm = LoggedRhythm.from_phase(track.t_ns, track.values)
             if np.ptp(rhythm.cycles) >= 1.0:
                 amplitude = by_name.get(f"{name.removesuffix('.phase')}.A")
                 swing = float(np.nanmax(np.abs(amplitude.values))) if amplitude else 0.0
-                found.append((swing, rhythm))
-    return max(found, key=lambda one: one[0], default=(0.0, None))[1]
+                rhythms.append((swing, rhythm))
+    return max(rhythms, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
 def changes(states: Sequence[str]) -> list[int]:
@@ -224,8 +224,8 @@ def log_mode(
     Returns:
         How often a mode began.
     """
-    found = _read(session, MODE, {"data": str}, warnings)
-    turns = [(found[i][0], found[i][1].data) for i in changes([one.data for _, one in found])]
+    modes = _read(session, MODE, {"data": str}, warnings)
+    turns = [(modes[i][0], modes[i][1].data) for i in changes([mode.data for _, mode in modes])]
     log_states(rec, clock, turns)
     return len(turns)
 
@@ -265,7 +265,9 @@ def log_lines(
     Args:
         events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
     """
-    lines = [(t_ns, f"{one.name}: {one.msg}" if one.name else one.msg) for t_ns, one in events]
+    lines = [
+        (t_ns, f"{event.name}: {event.msg}" if event.name else event.msg) for t_ns, event in events
+    ]
     log_texts(rec, clock, EVENTS, lines, [_LEVELS.get(event.level, INFO) for _, event in events])
 
 
@@ -286,14 +288,14 @@ def _read(
     session: SessionView, topic: str, fields: Mapping[str, type], warnings: list[str]
 ) -> list[tuple[int, Any]]:
     """Log time [ns] and message, up to the first one that is damaged; none without the fields."""
-    found: list[tuple[int, Any]] = []
+    messages: list[tuple[int, Any]] = []
     if topic in session.channels:
         try:
-            found.extend(session.messages(topic))
+            messages.extend(session.messages(topic))
         except DataError as error:
             warnings.append(f"{topic}: shown up to a message that can't be read: {error}")
     for name, kind in fields.items():
-        if found and not isinstance(getattr(found[0][1], name, None), kind):
+        if messages and not isinstance(getattr(messages[0][1], name, None), kind):
             warnings.append(f"{topic}: not shown: its schema has no field {name} ({kind.__name__})")
             return []
-    return found
+    return messages

@@ -64,8 +64,8 @@ class Averaged:
         """Keep copies of what is averaged of the samples in a stretch's span."""
         for key, tracks in stretch.columns.items():
             for track in tracks if key[0] in _TOPICS else ():
-                own, wanted = (one.rows(track.t_ns) for one in (stretch.span, self._window))
-                rows = slice(max(own.start, wanted.start), min(own.stop, wanted.stop))
+                spanned, averaged = (span.rows(track.t_ns) for span in (stretch.span, self._window))
+                rows = slice(max(spanned.start, averaged.start), min(spanned.stop, averaged.stop))
                 if rows.start < rows.stop:
                     part = Track(track.name, track.t_ns[rows].copy(), track.values[rows].copy())
                     self._kept.setdefault(key, {}).setdefault(track.name, []).append(part)
@@ -85,13 +85,13 @@ class Averaged:
             for key, tracks in self._kept.items()
         }
 
-    def read(self, session: SessionView, wanted: Mapping[str, Sequence[str]]) -> Columns:
+    def read(self, session: SessionView, topics: Mapping[str, Sequence[str]]) -> Columns:
         """Read them.
 
         Args:
-            wanted: JointState topic to the fields that come.
+            topics: JointState topic to the fields that come.
         """
-        drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
+        drawn = {topic: fields for topic, fields in topics.items() if topic in _TOPICS}
         start_ns, stop_ns = self._window.start_ns, self._window.stop_ns
         columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
         session.forget()
@@ -130,7 +130,7 @@ def log_mean_cycle(
         warnings.append(
             f"the mean cycle leaves out {', '.join(false)}: a sensor falsifies the angles"
         )
-    moved = mean_cycles([one for one in measured if one.name not in false], pace)
+    moved = mean_cycles([track for track in measured if track.name not in false], pace)
     if moved is None:
         return None
     asked = mean_cycles(commanded, pace)

@@ -247,10 +247,10 @@ class Plot:
         """
         by_name = {track.name: track for track in tracks}
         for series in self.series:
-            own = [by_name[name] for name in series.names if name in by_name]
-            if not own:
+            members = [by_name[name] for name in series.names if name in by_name]
+            if not members:
                 continue
-            table = join_tracks(own)
+            table = join_tracks(members)
             values = np.full((table.t_ns.size, len(series.names)), np.nan)
             values[:, [series.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, known_ns)
@@ -378,8 +378,8 @@ class Plots:
     ) -> None:
         """Add a plot of head, middle and tail alone, which can be read at a glance."""
         chosen = [tuple(name for name in part if name in places.names) for part in parts]
-        own = [one for one in samples.get(source, ()) if one.name in places.names]
-        plot = Plot(f"{PLACES}/{kind}", [part for part in chosen if part], own, degrees=True)
+        tracks = [track for track in samples.get(source, ()) if track.name in places.names]
+        plot = Plot(f"{PLACES}/{kind}", [part for part in chosen if part], tracks, degrees=True)
         self._places[source] = plot
         colors = self._palette if kind == "measured" else None
         plot.style(self._rec, colors, **places_look(places, kind))

@@ -140,11 +140,11 @@ def log_rays(
     rec.log(RANGES, look, static=True)
     for part, times in clock.rows(motion.t_ns[chosen]):
         origin, vector = rays(motion.robot, sensors, *motion.links(chosen[part]), reading[part])
-        known = np.isfinite(origin).all(axis=-1) & np.isfinite(vector).all(axis=-1)
+        finite = np.isfinite(origin).all(axis=-1) & np.isfinite(vector).all(axis=-1)
         columns = rr.Arrows3D.columns(
-            origins=rounded_to(origin[known], ROUNDING),
-            vectors=rounded_to(vector[known], ROUNDING),
-        ).partition(np.count_nonzero(known, axis=1))
+            origins=rounded_to(origin[finite], ROUNDING),
+            vectors=rounded_to(vector[finite], ROUNDING),
+        ).partition(np.count_nonzero(finite, axis=1))
         rec.send_columns(RANGES, times, columns)
 
 
@@ -207,8 +207,8 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
         return None
     faults = Faults()
     world = read_world(StrictTable(values, "", faults).table("world"), None, 0)
-    if found := faults.all():
-        reason = "; ".join(map(str, found))
+    if problems := faults.all():
+        reason = "; ".join(map(str, problems))
         warnings.append(f"the attached scenario has faults, obstacles are not drawn: {reason}")
         return None
     return world
@@ -316,7 +316,7 @@ class Scene:
         if rows.stop <= rows.start:
             return
         motion = assemble(self._robot, self._head.at(rows), stretch.columns)
-        own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
-        sparse = self._sparse[own] - rows.start
-        ranges = self._sensors, self._distance[own]
+        part = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
+        sparse = self._sparse[part] - rows.start
+        ranges = self._sensors, self._distance[part]
         log_motion(self._rec, self._clock, motion, sparse, look=self._look, ranges=ranges)

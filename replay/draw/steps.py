@@ -83,8 +83,8 @@ def cycle_tables(analysis: Analysis, steady: CycleMaps | None = None) -> tuple[C
         response = [table, replace(table, quantity=LAG, value=np.degrees(steady.lag_rad))]
     else:
         response = []
-    found = [*response, *_energy(analysis)]
-    return tuple(table for table in found if np.isfinite(table.value).any())
+    tables = [*response, *_energy(analysis)]
+    return tuple(table for table in tables if np.isfinite(table.value).any())
 
 
 def together(tables: Sequence[CycleTable]) -> CycleTable:
@@ -102,8 +102,8 @@ def together(tables: Sequence[CycleTable]) -> CycleTable:
 
     def rows(table: CycleTable) -> FloatArray:
         at = np.searchsorted(table.start_s, middle, side="right") - 1
-        own = np.maximum(at, 0)
-        return np.where((at >= 0) & (middle < table.stop_s[own]), table.value[:, own], np.nan)
+        cycle = np.maximum(at, 0)
+        return np.where((at >= 0) & (middle < table.stop_s[cycle]), table.value[:, cycle], np.nan)
 
     names = tuple(name for table in tables for name in table.names)
     return replace(main, names=names, value=np.concatenate([rows(table) for table in tables]))
@@ -125,8 +125,8 @@ def log_cycles(
     """
     quantities: list[tuple[CycleQuantity, tuple[PlottedSeries, ...]]] = []
     for quantity in dict.fromkeys(table.quantity for table in tables):
-        own = [_steps(table, clock.start_ns) for table in tables if table.quantity == quantity]
-        parts = tables_of(list(chain.from_iterable(own)))
+        steps = [_steps(table, clock.start_ns) for table in tables if table.quantity == quantity]
+        parts = tables_of(list(chain.from_iterable(steps)))
         paths = part_entities(f"{CYCLES}/{quantity.key}", [part.names for part in parts])
         series: list[PlottedSeries] = []
         for entity, part in zip(paths, parts, strict=True):
@@ -203,13 +203,13 @@ def _energy(analysis: Analysis) -> list[CycleTable]:
     energy = analysis.energy
     if energy is None or analysis.gait.frequency_hz.value is None:
         return []
-    known = [joint for joint in energy.joints if joint.net_j is not None]
-    if not known:
+    joints = [joint for joint in energy.joints if joint.net_j is not None]
+    if not joints:
         return []
-    value = np.array([joint.net_j for joint in known], dtype=np.float64)
-    covered = np.array([joint.coverage for joint in known], dtype=np.float64)
+    value = np.array([joint.net_j for joint in joints], dtype=np.float64)
+    covered = np.array([joint.coverage for joint in joints], dtype=np.float64)
     value = np.where(covered >= LEAST_COVERED, value, np.nan)
-    names, start_s = tuple(joint.name for joint in known), np.array(energy.start_s)
+    names, start_s = tuple(joint.name for joint in joints), np.array(energy.start_s)
     return [CycleTable(ENERGY, names, start_s, np.array(energy.stop_s), value)]
 
 
@@ -226,17 +226,17 @@ def charts(analysis: Analysis) -> tuple[Chart, ...]:
     joints = analysis.joints
     share = 1.0 / (sum(window.cycles for window in analysis.gait.windows) or 1)
     energy = [Estimate(joint.energy_net_j) for joint in joints]
-    found = (
+    bar_charts = (
         Chart(GAIN.key, "Gain − 1 [%]", _bars(joints, [j.gain for j in joints], 100.0, 1.0)),
         Chart(LAG.key, "Lag [°]", _bars(joints, [j.lag_rad for j in joints], math.degrees(1.0))),
         Chart(ENERGY.key, "Net energy [J]", _bars(joints, energy, share)),
     )
-    return tuple(chart for chart in found if chart.bars)
+    return tuple(chart for chart in bar_charts if chart.bars)
 
 
 def log_charts(
     rec: rr.RecordingStream,
-    found: tuple[Chart, ...],
+    bar_charts: tuple[Chart, ...],
     palette: Mapping[str, Color],
     named: Collection[str] = (),
 ) -> None:
@@ -246,7 +246,7 @@ def log_charts(
         palette: Colour by joint name.
         named: Joints whose bars carry a mark, a thin line on their left.
     """
-    for chart in found:
+    for chart in bar_charts:
         tallest = max((bar.value for bar in chart.bars), key=abs, default=0.0)
         marked = [bar.place + _MARK_LEFT for bar in chart.bars if bar.joint in named]
         entity = f"{SEGMENTS}/{chart.key}"
@@ -288,11 +288,11 @@ def log_bar(
 def log_current(
     rec: rr.RecordingStream,
     clock: TimeColumns,
-    found: Sequence[Chart],
+    bar_charts: Sequence[Chart],
     tables: Sequence[CycleTable],
 ) -> None:
     """Write the bars of the cycle at the time cursor."""
-    for chart in found:
+    for chart in bar_charts:
         parts = [table for table in tables if table.quantity.key == chart.key]
         if parts:
             _log_rows(rec, clock, chart, together(parts))
@@ -308,23 +308,23 @@ def _log_rows(rec: rr.RecordingStream, clock: TimeColumns, chart: Chart, table: 
     heights = np.append(table.value[row], np.full((len(row), 1), np.nan), axis=1).T
     for rows, times in clock.rows(t_ns):
         height = heights[rows]
-        known = np.isfinite(height)
-        many = np.count_nonzero(known, axis=1)
-        one = np.ones_like(many)
+        finite = np.isfinite(height)
+        many = np.count_nonzero(finite, axis=1)
+        singles = np.ones_like(many)
         wide = np.full(many.sum(), _CURRENT_WIDTH, np.float32)
         look: Any = rr.BarChart([0.0], color=CURRENT).color
         columns = [
-            _column(rr.BarChart.descriptor_values(), _tensors(height[known], many), one),
+            _column(rr.BarChart.descriptor_values(), _tensors(height[finite], many), singles),
             _column(
                 rr.BarChart.descriptor_abscissa(),
-                _tensors(np.broadcast_to(left, height.shape)[known], many),
-                one,
+                _tensors(np.broadcast_to(left, height.shape)[finite], many),
+                singles,
             ),
             _column(rr.BarChart.descriptor_widths(), arrow.array(wide), many),
             _column(
                 rr.BarChart.descriptor_color(),
                 arrow.array(np.repeat(look.as_arrow_array().to_numpy(), many.size)),
-                one,
+                singles,
             ),
         ]
         rec.send_columns(f"{SEGMENTS}/{chart.key}/current", times, columns)
@@ -344,18 +344,18 @@ def _tensors(numbers: FloatArray, lengths: IntArray) -> Any:
     Returns:
         Arrow array of n structures.
     """
-    one: Any = rr.BarChart([0.0]).values
-    shape, names, buffer = one.as_arrow_array().type
+    tensor: Any = rr.BarChart([0.0]).values
+    shape, names, buffer = tensor.as_arrow_array().type
     fields: list[Any] = list(buffer.type)
     number = [field.name for field in fields].index("F64")
-    each = np.arange(lengths.size + 1, dtype=np.int32)
+    bounds = np.arange(lengths.size + 1, dtype=np.int32)
     ends = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
     children = [arrow.nulls(0, field.type) for field in fields]
     children[number] = arrow.ListArray.from_arrays(ends, numbers, type=fields[number].type)
     codes = np.full(lengths.size, number, dtype=np.int8)
-    offsets = [None, arrow.py_buffer(codes), arrow.py_buffer(each[:-1])]
+    offsets = [None, arrow.py_buffer(codes), arrow.py_buffer(bounds[:-1])]
     parts = [
-        arrow.ListArray.from_arrays(each, lengths.astype(np.uint64), type=shape.type),
+        arrow.ListArray.from_arrays(bounds, lengths.astype(np.uint64), type=shape.type),
         arrow.nulls(lengths.size, names.type),
         arrow.Array.from_buffers(buffer.type, lengths.size, offsets, children=children),
     ]
@@ -380,7 +380,9 @@ def _bars(
     baseline: float = 0.0,
 ) -> tuple[Bar, ...]:
     pairs = zip(joints, estimates, strict=True)
-    bars = (bar_of(j.name, i + 1, one, scale, baseline) for i, (j, one) in enumerate(pairs))
+    bars = (
+        bar_of(j.name, i + 1, estimate, scale, baseline) for i, (j, estimate) in enumerate(pairs)
+    )
     return tuple(bar for bar in bars if bar is not None)
 
 

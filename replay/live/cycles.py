@@ -176,11 +176,11 @@ class CycleMeter:
         joints = [n for n in self._stores[_POSITION] if n in self._stores[_COMMAND]]
         by_phase: dict[str, list[str]] = {}
         for joint in joints:
-            own = run.phase_name(joint, planes.get(joint, ""))
-            main = run.phase_name("", planes.get(joint, "")) or own
+            phase = run.phase_name(joint, planes.get(joint, ""))
+            main = run.phase_name("", planes.get(joint, "")) or phase
             if main is not None:
                 by_phase.setdefault(main, []).append(joint)
-        for name, own in by_phase.items():
+        for name, group in by_phase.items():
             whole = _whole(run.values[name])
             if not np.all(np.diff(whole) > 0):
                 self._next.pop(name, None)
@@ -195,10 +195,10 @@ class CycleMeter:
                 stop = int(np.searchsorted(run.t_s, late)) + _BEYOND
                 if stop > run.t_s.size and not over:
                     break
-                if not self._ready(float(run.t_s[min(stop, run.t_s.size) - 1]), own):
+                if not self._ready(float(run.t_s[min(stop, run.t_s.size) - 1]), group):
                     break
                 near = slice(max(int(np.searchsorted(run.t_s, early)) - _BEYOND, 0), stop)
-                yield self._cycle(run, near, (begin, end), own, planes)
+                yield self._cycle(run, near, (begin, end), group, planes)
                 number += 1
             self._next[name] = first, number
 
@@ -223,8 +223,8 @@ class CycleMeter:
         edges_s: FloatArray = np.array(edges)
         gain, lag, power = (np.full(len(joints), np.nan) for _ in range(3))
         for i, joint in enumerate(joints):
-            own = run.phase_name(joint, planes.get(joint, "")) or ""
-            phase = LoggedPhase(run.t_s[near], _whole(run.values[own])[near])
+            name = run.phase_name(joint, planes.get(joint, "")) or ""
+            phase = LoggedPhase(run.t_s[near], _whole(run.values[name])[near])
             command, response = self._series(_COMMAND, joint), self._series(_POSITION, joint)
             if command.count > 1 and response.count > 1 and np.ptp(command.values) > 0.0:
                 asked, given = demodulate(command, response, phase, edges_s)
@@ -242,10 +242,10 @@ class CycleMeter:
         both = [
             (self._track(key, joint),) for key in (_EFFORT, _VELOCITY) if joint in self._stores[key]
         ]
-        found = products(*both) if len(both) == 2 else ()
-        if not found:
+        power = products(*both) if len(both) == 2 else ()
+        if not power:
             return float("nan")
-        (track,) = found
+        (track,) = power
         series = clean(joint, track.t_ns, track.values, self._origin_ns).between(*edges)
         if series.count < 2:
             return float("nan")
@@ -335,8 +335,8 @@ class CycleBars:
             self._write_bars(rec, quantity, tracks, palette)
             rec.reset_time()
             before = self._plots.get(quantity)
-            known = [] if before is None else [series.names for series in before.series]
-            plot = Plot(f"{CYCLES}/{quantity.key}", refined(known, [cycle.names]))
+            drawn = [] if before is None else [series.names for series in before.series]
+            plot = Plot(f"{CYCLES}/{quantity.key}", refined(drawn, [cycle.names]))
             plot.style(rec, palette, steps=True)
             plot.write(rec, clock, tracks)
             self._plots[quantity] = plot

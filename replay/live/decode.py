@@ -157,23 +157,23 @@ class LiveLog:
             by_channel.setdefault(message.channel_id, []).append(message)
             batch.messages += 1
         topics: list[tuple[_Topic, list[LiveMessage]]] = []
-        for channel_id, own in by_channel.items():
+        for channel_id, group in by_channel.items():
             topic = self._topics.get(channel_id)
             if topic is None:
-                self.unread += len(own)
+                self.unread += len(group)
             else:
-                topics.append((topic, own))
+                topics.append((topic, group))
         topics.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these shift the times
-        for topic, own in topics:
-            self._read(topic, own, batch)
+        for topic, group in topics:
+            self._read(topic, group, batch)
         return batch
 
     # -- definitions -----------------------------------------------------------------------
 
     def _define_channel(self, channel: Channel) -> None:
         schema = self._schemas.get(channel.schema_id)
-        known = self._topics.get(channel.id)
-        if schema is None or (known is not None and known.channel == channel):
+        topic = self._topics.get(channel.id)
+        if schema is None or (topic is not None and topic.channel == channel):
             return
         kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
         self._topics[channel.id] = _Topic(channel, schema, kind, _sorter(kind))
@@ -215,7 +215,10 @@ class LiveLog:
         groups = self._groups(topic, messages)
         if not groups:
             return None
-        rows = [np.concatenate([group.values(one) for one in fields], axis=1) for group in groups]
+        rows = [
+            np.concatenate([group.values(field_name) for field_name in fields], axis=1)
+            for group in groups
+        ]
         t_ns = np.concatenate([group.t_ns for group in groups])
         return t_ns, np.concatenate(rows).astype(np.float64)
 
@@ -228,29 +231,31 @@ class LiveLog:
         if name in OFFSETS:
             self._keep_offsets(name, [_joint_rows(group, "position") for group in groups])
             return
-        own: dict[tuple[str, int], IntArray] = {}  # the fields of a message share their times
-        for one in fields:
-            rows = [_joint_rows(group, one) for group in groups]
-            tracks = self._tracks(name, one, [row for row in rows if row.values.size], own)
+        shifted: dict[tuple[str, int], IntArray] = {}  # the fields of a message share their times
+        for field_name in fields:
+            rows = [_joint_rows(group, field_name) for group in groups]
+            tracks = self._tracks(
+                name, field_name, [row for row in rows if row.values.size], shifted
+            )
             if tracks:
-                batch.columns[name, one] = tracks
+                batch.columns[name, field_name] = tracks
 
     def _tracks(
         self,
         topic: str,
-        one: str,
+        field_name: str,
         rows: Sequence[JointRows],
-        own: dict[tuple[str, int], IntArray],
+        shifted: dict[tuple[str, int], IntArray],
     ) -> tuple[Track, ...]:
-        names, times, values = merge_rows(rows, topic, one, _ignore)
+        names, times, values = merge_rows(rows, topic, field_name, _ignore)
         offsets = self._offsets.get(OFFSET_TOPICS.get(topic, ""), {})
         tracks: dict[str, Track] = {}
         for name, t_ns, column in zip(names, times, values, strict=True):
             if name in offsets:
                 key = name, t_ns.size
-                if key not in own:
-                    own[key] = moved(t_ns, *offsets[name])
-                t_ns = own[key]  # noqa: PLW2901
+                if key not in shifted:
+                    shifted[key] = moved(t_ns, *offsets[name])
+                t_ns = shifted[key]  # noqa: PLW2901
             track = without_filler(Track(name, *ordered(t_ns, column)))
             if np.isfinite(track.values).any():
                 tracks[name] = track
@@ -284,33 +289,33 @@ class LiveLog:
         for message in messages:
             by_length.setdefault(len(message.payload), []).append(message)
         for length, rest in by_length.items():
-            data = np.frombuffer(b"".join(one.payload for one in rest), dtype=np.uint8)
+            data = np.frombuffer(b"".join(message.payload for message in rest), dtype=np.uint8)
             matrix = data.reshape(len(rest), length)
-            log_ns = np.array([one.log_time_ns for one in rest], dtype=np.int64)
+            log_ns = np.array([message.log_time_ns for message in rest], dtype=np.int64)
             for rows, layout, *_ in topic.sorter.sort(matrix):
                 if isinstance(layout, DataError):
                     self.unread += 1
                 else:
-                    own, own_log_ns = matrix[rows], log_ns[rows]
-                    t_ns = self._on_log_clock(stamps_of(layout, own), own_log_ns)
-                    groups.append(_Group(layout, t_ns, own_log_ns, own))
+                    payloads, logged_ns = matrix[rows], log_ns[rows]
+                    t_ns = self._on_log_clock(stamps_of(layout, payloads), logged_ns)
+                    groups.append(_Group(layout, t_ns, logged_ns, payloads))
         if topic.sorter.is_full:
             topic.sorter = _sorter(topic.kind)
         return groups
 
     def _general(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[tuple[int, Any]]:
         """Log times and messages of any shape."""
-        found: list[tuple[int, Any]] = []
+        decoded: list[tuple[int, Any]] = []
         try:
             decode = topic.decode = topic.decode or decoder_of(topic.schema, topic.channel.topic)
-            found.extend((message.log_time_ns, decode(message.payload)) for message in messages)
+            decoded.extend((message.log_time_ns, decode(message.payload)) for message in messages)
         except DataError:
-            self.unread += len(messages) - len(found)
-        return found
+            self.unread += len(messages) - len(decoded)
+        return decoded
 
 
-def _joint_rows(group: _Group, one: str) -> JointRows:
-    values = group.values(one).astype(np.float64)
+def _joint_rows(group: _Group, field_name: str) -> JointRows:
+    values = group.values(field_name).astype(np.float64)
     return JointRows(names_of(group.layout), group.t_ns, group.log_ns, values)
 
 

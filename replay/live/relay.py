@@ -142,7 +142,7 @@ class Inbox(AbstractContextManager["Inbox"]):
             else:
                 kept[_said(oldest)] = oldest
         self._queue.extendleft(reversed(kept.values()))
-        self._bytes += sum(len(one.data) for one in kept.values())
+        self._bytes += sum(len(datagram.data) for datagram in kept.values())
 
 
 def _said(datagram: Datagram) -> bytes:
@@ -163,13 +163,13 @@ def _bind(path: Path) -> tuple[socket.socket, Identity]:
     try:
         link.bind(str(draft))
         draft.chmod(0o600)
-        found = draft.stat()
+        status = draft.stat()
         draft.replace(path)
     except OSError as error:
         link.close()
         draft.unlink(missing_ok=True)
         raise UsageError(f"{path}: the socket can't be made: {error.strerror or error}") from error
-    return link, (found.st_dev, found.st_ino)
+    return link, (status.st_dev, status.st_ino)
 
 
 def _answers(path: Path) -> bool:
@@ -212,7 +212,7 @@ class LiveStream(BoundedStream):
     def __init__(self, application_id: str, **options: Any) -> None:
         """Make a stream that isn't connected yet."""
         super().__init__(application_id, **options)
-        self._said: dict[tuple[str, str], Any] = {}  # Arrow arrays
+        self._sent: dict[tuple[str, str], Any] = {}  # Arrow arrays
 
     def log(
         self,
@@ -238,9 +238,9 @@ class LiveStream(BoundedStream):
             (entity_path, str(batch.component_descriptor())): batch.as_arrow_array()
             for batch in batches
         }
-        known = self._said
-        news = [key for key in values if key not in known or not known[key].equals(values[key])]
-        known.update(values)
+        sent = self._sent
+        news = [key for key in values if key not in sent or not sent[key].equals(values[key])]
+        sent.update(values)
         return bool(news)
 
 

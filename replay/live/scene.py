@@ -70,13 +70,13 @@ class _Window:
         """Take new samples, and forget the oldest."""
         self.late_ns = None
         for key, tracks in batch.columns.items():
-            own = self._tracks.setdefault(key, {})
+            by_name = self._tracks.setdefault(key, {})
             for track in tracks:
-                old = own.get(track.name)
+                old = by_name.get(track.name)
                 if old is not None and track.t_ns[0] <= old.t_ns[-1]:
                     self.late_ns = min(self.late_ns or 1 << 62, int(track.t_ns[0]))
                 kept = None if old is None else (old.t_ns, old.values)
-                own[track.name] = Track(track.name, *_grown(kept, track.t_ns, track.values))
+                by_name[track.name] = Track(track.name, *_grown(kept, track.t_ns, track.values))
         for topic, (t_ns, values) in batch.ranges.items():
             self.ranges[topic] = _grown(self.ranges.get(topic), t_ns, values)
         if batch.head is not None:
@@ -203,7 +203,7 @@ class LiveScene:
         columns = self._window.columns
         tracks = quantities(columns)
         measured, commanded = (
-            tracks.get(one, ()) for one in (entities.MEASURED, entities.COMMANDED)
+            tracks.get(entity, ()) for entity in (entities.MEASURED, entities.COMMANDED)
         )
         names = [track.name for track in measured or commanded]
         self._palette = palette_of(self._log.robot, names)
@@ -230,8 +230,8 @@ class LiveScene:
 
     def _draw_lines(self, tracks: Mapping[str, Sequence[Track]], columns: Columns) -> None:
         """Write what is new of all lines; those that part once stay apart."""
-        for entity, track in tracks.items():
-            now = [tuple(one.name for one in part) for part in sampled_together(track)]
+        for entity, group in tracks.items():
+            now = [tuple(track.name for track in part) for part in sampled_together(group)]
             self._parts[entity] = refined(self._parts.get(entity, ()), now)
         plotted = dict(self._parts), self._places, self._palette
         if plotted != self._plotted:
@@ -253,17 +253,18 @@ class LiveScene:
         if self._places is not None and now < self._places_at:
             return
         self._places_at = now + _PLACES_EVERY_S
-        found = lines.head_middle_tail(self._log.robot, moving)
-        if found is None or found == self._places:
+        places = lines.head_middle_tail(self._log.robot, moving)
+        if places is None or places == self._places:
             return
-        if self._places is not None and self._places.plane is not found.plane:
+        if self._places is not None and self._places.plane is not places.plane:
             swing = {track.name: float(np.nanstd(track.values)) for track in moving}
             before, after = (
-                max(swing.get(name, 0.0) for name in one.names) for one in (self._places, found)
+                max(swing.get(name, 0.0) for name in choice.names)
+                for choice in (self._places, places)
             )
             if after < _CLEARER * before + 1e-3:
                 return
-        self._places = found
+        self._places = places
 
     def _draw_words(self, batch: SampleBatch) -> None:
         turns: list[tuple[int, str]] = []

@@ -207,7 +207,7 @@ class Survey:
     """Content of a session.
 
     Attributes:
-        wanted: JointState topic to the fields that come.
+        topics: JointState topic to the fields that come.
         samples: Entity to its lines, some of their samples each, in chain order.
         parts: Entity to the names of its lines, those in one part that are drawn at common times.
         drawing_ns: Sampling times of the first measured joint, thinned [ns], shape (n,).
@@ -217,7 +217,7 @@ class Survey:
         is_whole: Whether all of the session was read.
     """
 
-    wanted: Mapping[str, Sequence[str]]
+    topics: Mapping[str, Sequence[str]]
     samples: Mapping[str, tuple[Track, ...]]
     parts: Mapping[str, tuple[tuple[str, ...], ...]]
     drawing_ns: IntArray
@@ -274,7 +274,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
                 power = resampled(tracks, names, tracks[0].t_ns[::thin], interpolate)
                 powers.append(segment_power(power))
     return Survey(
-        wanted={topic: fields for topic, fields in wanted.items() if fields},
+        topics={topic: fields for topic, fields in wanted.items() if fields},
         samples={
             entity: tuple(
                 one_after_another(line[name])

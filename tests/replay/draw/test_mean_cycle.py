@@ -163,8 +163,8 @@ def test_what_was_kept_stretch_by_stretch_is_what_is_read_at_once(twin, monkeypa
             Sources.of(session),
             clock_of(session),
         )
-        averaged, wanted = Averaged(clock, analysis), sources.found.wanted
-        stretches = list(timeline.stretches(session, wanted, sources.found.context_ns))
+        averaged, wanted = Averaged(clock, analysis), sources.survey.topics
+        stretches = list(timeline.stretches(session, wanted, sources.survey.context_ns))
         for stretch in stretches:
             averaged.keep(stretch)
         kept, read = averaged.kept, averaged.read(session, wanted)

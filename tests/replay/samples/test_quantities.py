@@ -170,7 +170,7 @@ def test_the_fields_that_come_are_found(opened):
         "/gait": ["position"],
     }  # fmt: skip
     found = quantities.survey(session, 50.0)
-    assert found.wanted == {"/joint_states": ["position", "velocity"], "/warm": ["position"]}
+    assert found.topics == {"/joint_states": ["position", "velocity"], "/warm": ["position"]}
     assert found.seen["/joint_states", "velocity"] == set(names)
     assert found.power_limit_w is None
     assert found.is_whole

@@ -95,7 +95,7 @@ def test_every_sample_is_in_one_stretch(session_file, monkeypatch):
     with Session.open(session_file) as session:
         found = survey(session, 50.0)
         whole = session.joints("/joint_states").t_ns
-        parts = list(stretches.stretches(session, found.wanted, found.context_ns))
+        parts = list(stretches.stretches(session, found.topics, found.context_ns))
     assert len(parts) > 3
     for i, name in enumerate(("joint01", "joint02")):
         pieces = []
@@ -117,7 +117,7 @@ def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25, o
     assert [sample.name for sample in found.samples["/joints/measured"]] == list(
         snake25.joint_names
     )
-    assert found.wanted["/joint_states"] == ["position", "velocity", "effort"]
-    assert "/gait" not in found.wanted
+    assert found.topics["/joint_states"] == ["position", "velocity", "effort"]
+    assert "/gait" not in found.topics
     assert found.context_ns == pytest.approx(6 * 100_000_000, rel=0.01)  # ten times a second
     assert found.power_limit_w > 0.0
