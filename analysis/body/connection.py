@@ -138,8 +138,8 @@ class Connection:
         """Return A and the half width of its 95 % interval, each of shape (n, 3, k)."""
         count = self.base.share.size
         terms = _terms(phase)
-        own = self.coefficients.reshape(2, count, -1, 3)[0]
-        value = np.einsum("np,kpc->nck", terms, own)
+        coefficients = self.coefficients.reshape(2, count, -1, 3)[0]
+        value = np.einsum("np,kpc->nck", terms, coefficients)
         parts = self.covariance.reshape(3, 2, count, terms.shape[1], 2, count, terms.shape[1])
         square = np.einsum("np,ckpkq,nq->nck", terms, parts[:, 0, :, :, 0], terms)
         return value, t_factor(self.dof) * np.sqrt(np.maximum(square, 0.0))
@@ -226,7 +226,7 @@ def aligned_shapes(shapes: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         phase = np.angle(first @ mean.conj())
         mean = np.mean(first * np.exp(-1j * phase)[:, None], axis=0)
     phase = np.angle(first @ mean.conj())
-    return np.stack([turned(*one) for one in zip(shapes, phase, strict=True)]), mean
+    return np.stack([turned(*pair) for pair in zip(shapes, phase, strict=True)]), mean
 
 
 def _central(first: ComplexArray) -> ComplexArray:
@@ -376,7 +376,7 @@ def _rows(base: ShapeBase, perturbation: ComplexArray, phase: FloatArray) -> Flo
 def _same_gait(base: ShapeBase) -> FloatArray:
     """Return the rows whose product is B r0' - A' r0', shape (n, 2 k P)."""
     rate = wave_at(_rate(base.cycle), _GRID)
-    parts = [np.einsum("kn,np->nkp", rate, one) for one in (-_slopes(_GRID), _terms(_GRID))]
+    parts = [np.einsum("kn,np->nkp", rate, terms) for terms in (-_slopes(_GRID), _terms(_GRID))]
     return np.concatenate(parts, axis=1).reshape(_GRID.size, -1)
 
 
@@ -386,9 +386,9 @@ def _condition(base: ShapeBase, perturbations: Sequence[ComplexArray]) -> float:
     rate = np.stack(
         [wave_at(_rate(base.cycle + perturbation), _GRID) for perturbation in perturbations]
     )
-    known = wave_at(_rate(base.cycle), _GRID)[None] * len(perturbations) ** 0.5
+    shift = wave_at(_rate(base.cycle), _GRID)[None] * len(perturbations) ** 0.5
     design = np.concatenate(
-        [np.concatenate([rate, off], axis=1), np.concatenate([np.zeros_like(known), known], axis=1)]
+        [np.concatenate([rate, off], axis=1), np.concatenate([np.zeros_like(shift), shift], axis=1)]
     )
     size = np.linalg.svd(design.transpose(2, 0, 1), compute_uv=False)
     if size.shape[1] < design.shape[1] or not (size[:, -1] > 0).all():

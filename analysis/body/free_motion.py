@@ -71,8 +71,8 @@ class Oscillation:
         """
         shown = (factors * np.sqrt(self.bins.spread)) @ self.bins.values
         parts = np.stack([factors.real, -factors.imag], axis=-1)
-        own = np.einsum("pki,kij,qkj->pq", parts, self.bins.rounding, parts)
-        return (shown @ shown.conj().T).real / (2 * shown.shape[1]) + own
+        rounding = np.einsum("pki,kij,qkj->pq", parts, self.bins.rounding, parts)
+        return (shown @ shown.conj().T).real / (2 * shown.shape[1]) + rounding
 
     def error(self, factor: ComplexArray) -> float:
         """Return the standard error of Re sum_k factor_k da_k, factor of shape (m,)."""
@@ -310,7 +310,7 @@ def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
         The fit; None where no joint moves.
     """
     enough = [angle for angle in angles.values() if angle.count > gait.fit.model.size + 1]
-    series = [one for one in enough if np.ptp(one.values) > 0]
+    series = [angle for angle in enough if np.ptp(angle.values) > 0]
     if not series:
         return None
     fit = fit_at(series, gait.fit.omega, gait.fit.model)
@@ -319,7 +319,7 @@ def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
         series=tuple(series),
         fit=fit,
         oscillation=Oscillation(fit.fundamental, bins, fit.mean_time_s, gait.omega_error**2),
-        chain=tuple(one.name for one in enough),
+        chain=tuple(angle.name for angle in enough),
         omega_dof=gait.omega_dof,
     )
 
@@ -334,14 +334,14 @@ def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tupl
         The motion, and the names of moving joints whose phase noise leaves open.
     """
     motion, names = moved.oscillation, moved.names
-    known = motion.known_phases()
+    has_phase = motion.known_phases()
     lags = dict.fromkeys(names, Estimate())
     planes: dict[str, str] = {}
     waves: list[BodyWave] = []
     for plane, members in by_plane(robot, moved.chain).items():
         planes |= dict.fromkeys(members, plane)
         rows = [names.index(name) for name in members if name in names]
-        rows = [row for row in rows if known[row]]
+        rows = [row for row in rows if has_phase[row]]
         for before, joint in pairwise(rows):
             lags[names[joint]] = phase_lag(motion, joint, before)[0]
         if len(rows) > 1:
@@ -361,7 +361,7 @@ def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tupl
         for row, series in enumerate(moved.series)
     )
     return FreeMotion(joints, tuple(waves)), tuple(
-        name for name, one in zip(names, known, strict=True) if not one
+        name for name, phased in zip(names, has_phase, strict=True) if not phased
     )
 
 

@@ -201,7 +201,9 @@ def ground_contact(
     try:
         t_s, _, quaternion = head_poses(session, robot.links[0].name, span)
         vertical = rotation_from_quaternion(quaternion)[:, 2]  # world's z in the head's frame
-        up = [Series(axis, t_s, one) for axis, one in zip("xyz", vertical.T, strict=True)]
+        up = [
+            Series(axis, t_s, component) for axis, component in zip("xyz", vertical.T, strict=True)
+        ]
         parts = _cycles([angles[n] for n in names], [torques[n] for n in names], factors, span)
         loads = _explained(robot, up, list(parts))
     except (DataError, LogError) as error:
@@ -226,12 +228,12 @@ def _cycles(
         acting: list[Series] = []
         for signal, factor in zip(torques, factors.tolist(), strict=True):
             part = part_of(signal, start_ns, stop_ns, shared)
-            one = clean(part.name, part.t_ns, part.values, span.origin_ns)
-            acting.append(replace(one, values=factor * one.values))
+            torque = clean(part.name, part.t_ns, part.values, span.origin_ns)
+            acting.append(replace(torque, values=factor * torque.values))
         bent = [angle.between(edges[0], edges[-1]) for angle in angles]
-        sampled = min(one.count for one in (*acting, *bent)) >= PHASES // 2
+        sampled = min(channel.count for channel in (*acting, *bent)) >= PHASES // 2
         # A driver without torques fills in a constant.
-        if sampled and any(np.ptp(one.values) > 0 for one in acting):
+        if sampled and any(np.ptp(torque.values) > 0 for torque in acting):
             yield bent, acting, edges
 
 
@@ -241,10 +243,10 @@ def _explained(robot: Robot, up: Sequence[Series], cycles: Sequence[_Cycle]) -> 
     Raises:
         DataError: If no loads explain the torques, or the opposite torques fit better.
     """
-    found = [cycle_loads(robot, bent, acting, up, edges) for bent, acting, edges in cycles]
-    if not found:
+    fits = [cycle_loads(robot, bent, acting, up, edges) for bent, acting, edges in cycles]
+    if not fits:
         return np.zeros((0, PHASES, len(robot.links)))
-    misfit = float(np.median([one for _, one in found]))
+    misfit = float(np.median([residual for _, residual in fits]))
     if misfit > MISFIT:
         raise DataError(
             f"no loads of links explain the joints' torques (residuals of {misfit:.1f} times what "
@@ -252,10 +254,10 @@ def _explained(robot: Robot, up: Sequence[Series], cycles: Sequence[_Cycle]) -> 
             "touched?"
         )
     bent, acting, edges = cycles[0]
-    turned = [replace(one, values=-one.values) for one in acting]
-    if cycle_loads(robot, bent, turned, up, edges)[1] < OPPOSITE * found[0][1]:
+    turned = [replace(torque, values=-torque.values) for torque in acting]
+    if cycle_loads(robot, bent, turned, up, edges)[1] < OPPOSITE * fits[0][1]:
         raise DataError("the joints' torques seem to have the other sign than their angles")
-    return np.stack([loads for loads, _ in found])
+    return np.stack([loads for loads, _ in fits])
 
 
 def _torques(
@@ -264,8 +266,8 @@ def _torques(
     """Return where all joints' torques are from, their signals and the factors that make [N m]."""
     if all(name in columns.effort for name in robot.joint_names):
         return "effort", columns.effort, np.ones(len(robot.joints))
-    known = session.run is not None or "servo" not in robot.assumed
-    if known and all(name in columns.current for name in robot.joint_names):
+    described = session.run is not None or "servo" not in robot.assumed
+    if described and all(name in columns.current for name in robot.joint_names):
         constants = np.array([joint.servo.torque_constant for joint in robot.joints])
         return "current", columns.current, constants
     return "", {}, np.zeros(0)

@@ -153,11 +153,11 @@ def places(
         Positions x + j y [m] of the link centres, shape (cycles * SAMPLES, number of links).
     """
     centre, _ = _shape(chain, motion.angles)
-    one = motion.head[:, None] + np.exp(1j * motion.heading)[:, None] * centre[:, list(links)]
+    cycle = motion.head[:, None] + np.exp(1j * motion.heading)[:, None] * centre[:, list(links)]
     start, turned = 0j, 1 + 0j
     parts: list[ComplexArray] = []
     for _ in range(cycles):
-        parts.append(start + turned * one)
+        parts.append(start + turned * cycle)
         start += turned * motion.displacement
         turned *= np.exp(1j * motion.turn)
     return np.concatenate(parts)

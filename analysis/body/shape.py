@@ -93,8 +93,8 @@ def body_shape(
     planes = plane_shapes(session.robot, moved, span, set(sound))
     travel, cycle = None, None
     try:
-        if (found := _path(session, sound, span)) is not None:
-            robot, path = found
+        if (measured := _path(session, sound, span)) is not None:
+            robot, path = measured
             omega = moved.fit.omega
             cycle = gait_cycle(robot, path, sound, omega, span.start_s)
             travel = _travel(path, cycle)
@@ -194,10 +194,10 @@ def _modes(series: Sequence[Series], span: Span) -> tuple[tuple[ShapeMode, ...],
         offsets.append(angles.mean(axis=(1, 2)))
     power = np.concatenate(parts)
     shares = [_share(power[:, k], power[:, -1]) for k in range(modes.shape[1])]
-    found = tuple(
+    shape_modes = tuple(
         ShapeMode(share, tuple(mode.tolist())) for share, mode in zip(shares, modes.T, strict=True)
     )
-    return found, mean_step(np.concatenate(offsets))
+    return shape_modes, mean_step(np.concatenate(offsets))
 
 
 def _cycles(series: Sequence[Series], span: Span) -> Iterator[FloatArray]:
@@ -215,10 +215,10 @@ def _share(part: FloatArray, whole: FloatArray) -> Estimate:
     if not whole.sum() > 0:
         return Estimate()
     value = float(part.sum() / whole.sum())
-    known = mean_of_cycles((part - value * whole) / whole.mean())
-    if known is None:
+    mean = mean_of_cycles((part - value * whole) / whole.mean())
+    if mean is None:
         return Estimate(value)
-    _, variance, dof = known
+    _, variance, dof = mean
     low, high = around(value, t_factor(dof) * variance**0.5)
     return Estimate(value, (max(0.0, low), min(1.0, high)))
 

@@ -151,10 +151,10 @@ def mean_step(steps: FloatArray, least: float = -np.inf, most: float = np.inf) -
         least: Where the interval ends at the latest.
         most: The same of its other end.
     """
-    known = mean_of_cycles(steps)
-    if known is None:
+    mean = mean_of_cycles(steps)
+    if mean is None:
         return Estimate(float(steps.mean()) if steps.size else None)
-    value, variance, dof = known
+    value, variance, dof = mean
     low, high = around(value, t_factor(dof) * variance**0.5)
     return Estimate(value, (max(least, low), min(most, high)))
 
@@ -178,10 +178,10 @@ def cost_of_transport(steps: CycleSteps, energy_j: FloatArray) -> tuple[float, f
         Value, variance, degrees of freedom; None where nothing is carried anywhere: a net step per
         cycle of less than three standard errors.
     """
-    known = mean_of_cycles(steps.forward_m)
-    if known is None or energy_j.size != steps.forward_m.size:
+    mean = mean_of_cycles(steps.forward_m)
+    if mean is None or energy_j.size != steps.forward_m.size:
         return None
-    step, variance, dof = known
+    step, variance, dof = mean
     if step <= _CLEAR * variance**0.5:
         return None
     weight = steps.mass_kg * GRAVITY
@@ -308,9 +308,9 @@ def gait_cycle(
     model = HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)))
     shape, velocity = (fit_at(some, omega, model) for some in (shapes, series))
     parts = np.zeros((2, max(len(names), 3), HARMONICS + 1), dtype=np.complex128)
-    for part, one in zip(parts, (shape, velocity), strict=True):
-        part[: len(one.trend), 0] = one.trend[:, 0]
-        part[: len(one.trend), 1 : 1 + model.harmonics] = one.amplitudes
+    for part, fit in zip(parts, (shape, velocity), strict=True):
+        part[: len(fit.trend), 0] = fit.trend[:, 0]
+        part[: len(fit.trend), 1 : 1 + model.harmonics] = fit.amplitudes
     shaped, moved_by = parts[0, : len(names)], parts[1, :3]
     return GaitCycle(names, shaped, moved_by, omega, _cycle_steps(path, omega, start_s))
 

@@ -228,7 +228,8 @@ def session_couplings(
         One a plane; none where no oscillator's phase was logged.
     """
     start_ns, stop_ns = (
-        None if one is None else session.start_ns + round(one * NS) for one in (start_s, stop_s)
+        None if time_s is None else session.start_ns + round(time_s * NS)
+        for time_s in (start_s, stop_s)
     )
     return tuple(
         chain_coupling(

@@ -97,8 +97,8 @@ def spectrum(P: FloatArray) -> Spectrum:
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
     """
-    found = eig(of_deviations(P), left=True, right=True)
-    values, left, right = (np.asarray(one, dtype=np.complex128) for one in found)
+    solution = eig(of_deviations(P), left=True, right=True)
+    values, left, right = (np.asarray(array, dtype=np.complex128) for array in solution)
     overlap = np.abs(np.sum(left.conj() * right, axis=0))  # columns are of length 1
     order = np.lexsort((values.imag, values.real))
     patterns = (_basis(len(P)) @ right[:, order]).astype(np.complex128)
@@ -149,12 +149,12 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
         drawn: P with errors that it may have, shape (draws, m, m).
     """
     here = spectrum(P)
-    draws = [spectrum(one) for one in drawn]
-    dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
-    strong, counts = float(here.strong), [float(one.strong) for one in draws]
+    draws = [spectrum(matrix) for matrix in drawn]
+    dealt = np.array([_dealt(here.rates, modes.rates) for modes in draws])
+    strong, counts = float(here.strong), [float(modes.strong) for modes in draws]
     low, high = np.quantile(counts, TAILS).tolist()
     fastest = growth(P)
-    growing = _mirrored(np.array(fastest), np.array([growth(one) for one in drawn]))
+    growing = _mirrored(np.array(fastest), np.array([growth(matrix) for matrix in drawn]))
     real = _mirrored(here.rates.real, dealt.real)
     return SpectrumIntervals(
         real=real,

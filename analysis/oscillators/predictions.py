@@ -190,17 +190,17 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     if coupling.scatter is not None:
         correlation = np.array(coupling.scatter.correlation)[:m, :m]
     P = measured(coupling.P, correlation)
-    found, ends = spectrum(P.value), intervals_of(P.value, P.value + noise_draws(P, 21))
+    modes, ends = spectrum(P.value), intervals_of(P.value, P.value + noise_draws(P, 21))
     like = spectrum(homogeneous(P.value))
     explicit = _explicit(P)
     return BodyOscillators(
-        answer=_answer(found, ends, like, explicit),
+        answer=_answer(modes, ends, like, explicit),
         joints=coupling.joints,
         slowest=ends.gap,
         strong=ends.strong,
         strong_above=STRONG,
         growth=ends.growth,
-        modes=_modes(found, ends),
+        modes=_modes(modes, ends),
         comparator=Comparator(like.gap, like.strong, tuple(like.rates.real.tolist())),
         explicit_coupling=explicit,
         pseudospectrum=pseudospectrum(P),
@@ -218,7 +218,7 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> NoisyMatr
         Value, errors, and the degrees of freedom that the intervals' factor implies.
     """
     value, error, half = (
-        np.array(one) for one in (matrix.value, matrix.standard_error, matrix.ci95_half)
+        np.array(values) for values in (matrix.value, matrix.standard_error, matrix.ci95_half)
     )
     # The degrees of freedom from the factor between the two.
     factor = np.divide(half, error, out=np.full(half.shape, np.nan), where=error > 0)
@@ -227,16 +227,16 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> NoisyMatr
     return NoisyMatrix(value, error, np.minimum(usable, _MOST_DOF), correlation)
 
 
-def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
+def _modes(modes: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     return tuple(
         Mode(
             real=Estimate(float(rate.real), tuple(ends.real[k].tolist())),
             imag=Estimate(float(rate.imag), tuple(ends.imag[k].tolist())),
-            sensitivity=float(found.sensitivity[k]),
-            pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
-            pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
+            sensitivity=float(modes.sensitivity[k]),
+            pattern_abs=tuple(np.abs(modes.patterns[:, k]).tolist()),
+            pattern_rad=tuple(np.angle(modes.patterns[:, k]).tolist()),
         )
-        for k, rate in enumerate(found.rates.tolist())
+        for k, rate in enumerate(modes.rates.tolist())
     )
 
 
@@ -254,11 +254,11 @@ def _explicit(P: NoisyMatrix) -> Estimate:
     return Estimate(value, (min(value, low), max(value, high)))
 
 
-def _answer(found: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
-    count = len(found.rates)
+def _answer(modes: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
+    count = len(modes.rates)
     answer = (
         f"through the body alone the slowest of {count} patterns {_pace(ends.gap)} and "
-        f"{found.strong} relax at more than {STRONG:g} eps (a homogeneous chain as "
+        f"{modes.strong} relax at more than {STRONG:g} eps (a homogeneous chain as "
         f"strong: {formats.number(like.gap, 3)} eps, {like.strong})"
     )
     if explicit.value is None:

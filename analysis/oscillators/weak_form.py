@@ -114,28 +114,28 @@ def _log(
 ) -> PhaseLog | None:
     t_ns = gait.signal(f"{names[0]}.phase").t_ns
     columns = np.stack([gait.signal(f"{name}.phase").values for name in names], axis=1)
-    known = np.isfinite(columns).all(axis=1)
-    known &= t_ns >= (t_ns[0] if span[0] is None else span[0])
-    known &= t_ns < (t_ns[-1] + 1 if span[1] is None else span[1])
-    if np.count_nonzero(known) < 3:
+    complete = np.isfinite(columns).all(axis=1)
+    complete &= t_ns >= (t_ns[0] if span[0] is None else span[0])
+    complete &= t_ns < (t_ns[-1] + 1 if span[1] is None else span[1])
+    if np.count_nonzero(complete) < 3:
         return None
-    t_ns = t_ns[known]
-    phases = np.unwrap(columns[known], axis=0)
+    t_ns = t_ns[complete]
+    phases = np.unwrap(columns[complete], axis=0)
     steps = np.diff(t_ns).astype(np.float64) / NS
     period_s = float(np.median(steps))
     whole: BoolArray = np.abs(steps - period_s) < _JITTER * period_s
-    whole &= _steady(gait, plane, known)
+    whole &= _steady(gait, plane, complete)
     inputs = None
     if angles is not None and set(names) <= set(angles.names):
-        inputs = _inputs(gait, plane, names, angles, (t_ns, phases, known, period_s))
+        inputs = _inputs(gait, plane, names, angles, (t_ns, phases, complete, period_s))
     return PhaseLog(plane, names, phases, period_s, whole, inputs)
 
 
-def _steady(gait: JointSignals, plane: str, known: BoolArray) -> BoolArray:
+def _steady(gait: JointSignals, plane: str, complete: BoolArray) -> BoolArray:
     """Return the steps over which the plane's rate is the usual one."""
-    rate = _value(gait, f"{plane}.omega", known)
+    rate = _value(gait, f"{plane}.omega", complete)
     if rate is None:
-        return np.ones(np.count_nonzero(known) - 1, dtype=np.bool_)
+        return np.ones(np.count_nonzero(complete) - 1, dtype=np.bool_)
     usual = float(np.median(rate))
     same = np.abs(rate - usual) <= _SAME * abs(usual)
     return same[:-1]
@@ -149,15 +149,15 @@ def _inputs(
     at: tuple[IntArray, FloatArray, BoolArray, float],
 ) -> FloatArray | None:
     """Return 2 (q - Y) / A cos phi of all joints; None where a value is missing."""
-    t_ns, phases, known, period_s = at
-    amplitude = _value(gait, f"{plane}.A", known)
+    t_ns, phases, complete, period_s = at
+    amplitude = _value(gait, f"{plane}.A", complete)
     size = 0.0 if amplitude is None else float(np.median(amplitude))
     if size <= 0.0:
         return None
     then_ns = t_ns - round(period_s * NS)
     felt = np.zeros_like(phases)
     for i, name in enumerate(names):
-        offset = _value(gait, f"{name}.offset", known)
+        offset = _value(gait, f"{name}.offset", complete)
         if offset is None:
             return None
         felt[:, i] = _held(angles.signal(name), then_ns) - offset
@@ -165,10 +165,10 @@ def _inputs(
     return 2.0 * np.nan_to_num(felt) / size * np.cos(phases)
 
 
-def _value(gait: JointSignals, name: str, known: BoolArray) -> FloatArray | None:
+def _value(gait: JointSignals, name: str, complete: BoolArray) -> FloatArray | None:
     if name not in gait.names:
         return None
-    return gait.signal(name).values[known]
+    return gait.signal(name).values[complete]
 
 
 def _held(signal: Signal, t_ns: IntArray) -> FloatArray:

@@ -232,8 +232,8 @@ def _centred(values: FloatArray) -> FloatArray:
 def _bounded(A: FloatArray, b: FloatArray, allowed: FloatArray, most: float) -> FloatArray:
     """Return the step dx of least squares within its bounds, shape (2 m,)."""
     upper = np.concatenate([np.full(len(allowed), most), np.minimum(allowed, most)])
-    found = lsq_linear(A, b, bounds=(np.full(len(upper), -most), upper), method="bvls")
-    return np.asarray(found.x, dtype=np.float64)
+    solution = lsq_linear(A, b, bounds=(np.full(len(upper), -most), upper), method="bvls")
+    return np.asarray(solution.x, dtype=np.float64)
 
 
 def _identified(M: FloatArray, variance: FloatArray) -> float:
@@ -252,7 +252,7 @@ def _matrix(coupling: LocalCoupling) -> tuple[FloatArray, FloatArray]:
             "those of undulog plan phase-kicks"
         )
     value, error = (
-        np.block([[np.array(getattr(one, part)) for one in row] for row in ((P, S), (R, G))])
+        np.block([[np.array(getattr(matrix, part)) for matrix in row] for row in ((P, S), (R, G))])
         for part in ("value", "standard_error")
     )
     return value, np.sum(np.square(error), axis=0)
@@ -291,43 +291,45 @@ def _driven(base: BaseGait, names: Sequence[str], after: Sequence[GaitRun]) -> D
     change = change * np.exp(-1j * np.angle(np.sum(change / np.abs(change))))  # an earlier start
     phase = np.angle(change)
     x = (np.log(np.abs(change)) + 1j * (phase - phase.mean())).astype(np.complex128)
-    one = pooled.response
-    ratio = (one.ratio * np.exp(x)).astype(np.complex128)
-    return DrivenStart(x, Response(ratio, one.log_gain_variance, one.lag_variance, one.dof))
+    response = pooled.response
+    ratio = (response.ratio * np.exp(x)).astype(np.complex128)
+    return DrivenStart(
+        x, Response(ratio, response.log_gain_variance, response.lag_variance, response.dof)
+    )
 
 
 def _limits(base: BaseGait, robot: Robot | None) -> FloatArray:
     """Return the largest amplitudes by position and by rate [rad], inf where none, shape (2, m)."""
-    found = np.full((2, len(base.driven)), np.inf)
+    limits = np.full((2, len(base.driven)), np.inf)
     joints = {} if robot is None else {joint.name: joint for joint in robot.joints}
     for row, k in enumerate(base.driven):
         joint = joints.get(base.names[k])
         if joint is not None:
             middle = float(base.offset[k])
-            found[:, row] = (
+            limits[:, row] = (
                 min(joint.upper - middle, middle - joint.lower),
                 joint.max_velocity / base.omega,
             )
-    return found
+    return limits
 
 
 def _spreads(response: Response) -> Spreads:
-    found = response_indices(response)
-    return Spreads(found["gain_cv"], found["lag_sd"])
+    indices = response_indices(response)
+    return Spreads(indices["gain_cv"], indices["lag_sd"])
 
 
 def _joint(
     name: str, x: complex, amplitude: float, limits: FloatArray, lacking: float
 ) -> JointCommand:
     limit = float(limits.min())
-    known = math.isfinite(limit)
+    limited = math.isfinite(limit)
     return JointCommand(
         name=name,
         phase_rad=float(x.imag),
         log_amplitude=float(x.real),
         amplitude_rad=float(amplitude),
-        limit_rad=limit if known else None,
-        limited_by=("position", "rate")[int(np.argmin(limits))] if known else None,
-        margin=1 - float(amplitude) / limit if known else None,
+        limit_rad=limit if limited else None,
+        limited_by=("position", "rate")[int(np.argmin(limits))] if limited else None,
+        margin=1 - float(amplitude) / limit if limited else None,
         lacking=float(lacking),
     )

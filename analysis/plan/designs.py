@@ -80,7 +80,7 @@ def phase_kicks(
     return tuple(runs)
 
 
-def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
+def reversal(amplitude: ComplexArray, repeats: int = 6) -> tuple[PlannedRun, ...]:
     """Plan runs of a wave and of its reverse, the robot turned by half a turn in half of each.
 
     A tilted floor then cancels between runs that are each other's mirror image: the wave at one
@@ -88,7 +88,7 @@ def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
 
     Args:
         amplitude: Of the gait, head to tail, shape (m,).
-        each: Runs each way.
+        repeats: Runs each way.
 
     Returns:
         Twice as many runs, the heading among their facts. Four make a block, in which the two
@@ -97,11 +97,11 @@ def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
     """
     ways = (("as-recorded", amplitude), ("reversed", amplitude[::-1]))
     runs: list[PlannedRun] = []
-    for k in range(2 * each):
-        way, own = ways[(k + k // 4) % 2]
+    for k in range(2 * repeats):
+        way, wave = ways[(k + k // 4) % 2]
         turned = k % 4 in (1, 2)
         facts = {"kind": way, HEADING: f"{math.pi if turned else 0.0:.6f}"}
-        runs.append(PlannedRun(f"{way}-{180 if turned else 0}", own, facts))
+        runs.append(PlannedRun(f"{way}-{180 if turned else 0}", wave, facts))
     return tuple(runs)
 
 
@@ -140,10 +140,12 @@ def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tupl
     runs: list[PlannedRun] = []
     for _ in range(repeats):
         for k in random.permutation(m).tolist():
-            each = [(amplitude * one * dft(m)[k]).astype(np.complex128) for one in strength]
-            more = tuple(Tone(float(w), a) for w, a in zip(omega[1:], each[1:], strict=True))
+            amplitudes = [
+                (amplitude * phasor * dft(m)[k]).astype(np.complex128) for phasor in strength
+            ]
+            more = tuple(Tone(float(w), a) for w, a in zip(omega[1:], amplitudes[1:], strict=True))
             facts = {"kind": "multisine", "experiment": str(k)}
-            runs.append(PlannedRun(f"experiment{k:02d}", each[0], facts, more))
+            runs.append(PlannedRun(f"experiment{k:02d}", amplitudes[0], facts, more))
     return tuple(runs)
 
 
@@ -281,27 +283,29 @@ def random_phase_runs(
         What they share, and the runs: one a realisation, or m with orthogonal inputs.
     """
     random = np.random.default_rng([seed, 1])
-    own = m if inputs == "orthogonal" else 1
-    drawn = [_phases(own, lines, random, rotated=own > 1) for _ in range(realisations)]
+    experiments = m if inputs == "orthogonal" else 1
+    drawn = [
+        _phases(experiments, lines, random, rotated=experiments > 1) for _ in range(realisations)
+    ]
     unit_rms = float(np.sqrt(lines.size / 2))
     highest = max(float(peaks.max()) for _, peaks in drawn)
     size = amplitude / (highest if of_peak else unit_rms)
     shared = Multisine(lines, period_s, size, size * highest)
     omega = 2 * np.pi * lines / period_s
-    turns = dft(own)
+    turns = dft(experiments)
     runs: list[PlannedRun] = []
     for r, (phasors, peaks) in enumerate(drawn):
-        for e in range(own):
-            each = np.broadcast_to(size * phasors * turns[e][:, None], (m, lines.size))
+        for e in range(experiments):
+            amplitudes = np.broadcast_to(size * phasors * turns[e][:, None], (m, lines.size))
             facts = {
                 "kind": KIND,
                 "realisation": str(r),
                 "experiment": str(e),
                 "crest_factor": f"{float(peaks.max()) / unit_rms:.4g}",
             }
-            label = f"realisation{r:02d}" + (f"-experiment{e:02d}" if own > 1 else "")
+            label = f"realisation{r:02d}" + (f"-experiment{e:02d}" if experiments > 1 else "")
             tones = tuple(
-                Tone(float(w), np.ascontiguousarray(each[:, k])) for k, w in enumerate(omega)
+                Tone(float(w), np.ascontiguousarray(amplitudes[:, k])) for k, w in enumerate(omega)
             )
             runs.append(PlannedRun(label, np.zeros(m, dtype=np.complex128), facts, tones))
     return shared, tuple(runs)

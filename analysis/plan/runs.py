@@ -105,9 +105,9 @@ def base_pose(session: SessionView, joints: Sequence[str] | None, omega: float) 
     """
     columns = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, Remarks())
     ends = {
-        name: (float(np.nanmin(one.values)), float(np.nanmax(one.values)))
-        for name, one in columns.command.items()
-        if np.isfinite(one.values).any()
+        name: (float(np.nanmin(command.values)), float(np.nanmax(command.values)))
+        for name, command in columns.command.items()
+        if np.isfinite(command.values).any()
     }
     names = tuple(name for name in columns.names if name in ends)
     chosen = columns.commanded() if joints is None else tuple(dict.fromkeys(joints))
@@ -275,11 +275,11 @@ def _check_limits(
     if like.robot.safety is not None:
         highest = np.fmin(highest, like.robot.safety.values("max_rate", tuple(joints))).tolist()
     fastest = dict(zip(joints, highest, strict=True))
-    known = [k for k in base.driven if base.names[k] in joints]
+    described = [k for k in base.driven if base.names[k] in joints]
     for run in runs:
         values = commands(base, run, t_s, ramp_s)
         rates = np.abs(np.diff(values, axis=0)).max(axis=0, initial=0.0) * RATE_HZ
-        for k in known:
+        for k in described:
             joint = joints[base.names[k]]
             low, high, rate = float(values[:, k].min()), float(values[:, k].max()), float(rates[k])
             if low < joint.lower or high > joint.upper:
