@@ -208,19 +208,19 @@ class Catalog:
         """
         begun, stop = time.monotonic(), stop or StopRequest()
         damaged_files = self._files.find_damaged()
-        known, versions = settled(self._files.known)
-        outdated = {name for name in known if damaged_files or versions[name] != _VERSION}
+        earlier, versions = settled(self._files.scanned)
+        outdated = {name for name in earlier if damaged_files or versions[name] != _VERSION}
         mentioned = settled(self._files.mentioned) if damaged_files else {}
-        listed = {file.name: file for file in list_sources(self._store, known)}
+        listed = {file.name: file for file in list_sources(self._store, earlier)}
         # Later than all scans before, whatever the clocks of others say.
-        before_ns = [*(scanned for _, _, scanned in known.values()), *mentioned.values()]
+        before_ns = [*(scanned for _, _, scanned in earlier.values()), *mentioned.values()]
         scanned_ns = max([time.time_ns(), *(scanned + 1 for scanned in before_ns)])
         facts = {name: (file.size, file.modified_ns) for name, file in listed.items()}
-        other = {name for name in listed if known.get(name, (0,))[:2] != facts[name]}
-        fresh = [one for one in listed.values() if one.name in other | outdated]
-        named = dict.fromkeys([*known, *(name.removeprefix(_ANALYSED) for name in mentioned)])
+        other = {name for name in listed if earlier.get(name, (0,))[:2] != facts[name]}
+        fresh = [file for file in listed.values() if file.name in other | outdated]
+        named = dict.fromkeys([*earlier, *(name.removeprefix(_ANALYSED) for name in mentioned)])
         gone = [name for name in named if name not in listed]
-        changed = [name for name in sorted(other) if listed[name].is_log and name in known]
+        changed = [name for name in sorted(other) if listed[name].is_log and name in earlier]
         self._remove([*gone, *(_ANALYSED + name for name in (*gone, *changed))], scanned_ns)
         read = damaged = 0
         for start in range(0, len(fresh), _BATCH):
@@ -228,18 +228,18 @@ class Catalog:
                 break
             rows: dict[str, list[Row]] = {"sessions": [], "analyses": [], "joints": []}
             sources: list[Row] = []
-            for file, found, fault in self._read_files(fresh[start : start + _BATCH]):
+            for file, rows_by_kind, fault in self._read_files(fresh[start : start + _BATCH]):
                 read += 1
                 damaged += bool(fault)
                 on_read(read, len(fresh))
                 stamp = {"scanned_ns": scanned_ns, "modified_ns": file.modified_ns}
                 common = {"source": file.name, "removed": False}
-                for kind, own in found.items():
-                    rows[kind] += [common | row | stamp for row in own]
-                own = {"size": file.size, "fault": fault or None, "version": _VERSION}
-                sources.append(common | own | stamp)
-            for kind, own in rows.items():
-                self._files.write(kind, own)
+                for kind, added in rows_by_kind.items():
+                    rows[kind] += [common | row | stamp for row in added]
+                details = {"size": file.size, "fault": fault or None, "version": _VERSION}
+                sources.append(common | details | stamp)
+            for kind, added in rows.items():
+                self._files.write(kind, added)
             self._files.write("sources", sources)
         complete, set_aside = read == len(fresh), list[str]()
         if damaged_files and complete:
@@ -330,8 +330,8 @@ class Catalog:
         """Return the rows of a file, and why it has none."""
         try:
             if file.is_log:
-                found = source_facts(self._store, file)
-                return file, {"sessions": [self._session(file, found)]}, found.damage
+                log_facts = source_facts(self._store, file)
+                return file, {"sessions": [self._session(file, log_facts)]}, log_facts.damage
             if file.name.endswith(".parquet"):
                 return file, self._sweep(file), ""
             return file, self._result(file) if file.name.endswith(".json") else {}, ""
@@ -356,9 +356,9 @@ class Catalog:
         if table.num_rows > _MOST_SWEPT:
             return {}
         every = map(sweep_rows, table.to_pylist())
-        known = [found for found in every if found is not None]
-        joints = [joint for _, own in known for joint in own]
-        rows = {"analyses": [analysis for analysis, _ in known], "joints": joints}
+        results = [result for result in every if result is not None]
+        joints = [joint for _, joint_rows in results for joint in joint_rows]
+        rows = {"analyses": [analysis for analysis, _ in results], "joints": joints}
         for kind, row in rows.items():
             table_of(kind, row)
         return rows
@@ -375,8 +375,10 @@ class Catalog:
     def _remove(self, names: Sequence[str], scanned_ns: int) -> None:
         gone = [{"source": name, "scanned_ns": scanned_ns, "removed": True} for name in names]
         for kind in SCHEMAS:
-            own = [row | ({"path": row["source"]} if kind == "sessions" else {}) for row in gone]
-            self._files.write(kind, own)
+            removed = [
+                row | ({"path": row["source"]} if kind == "sessions" else {}) for row in gone
+            ]
+            self._files.write(kind, removed)
         self._files.write("sources", gone)
 
     def _analysed(
@@ -394,12 +396,14 @@ class Catalog:
                 for future in done:
                     yield running.pop(future), future.result()
                 if stop.requested:  # what has begun is waited for, with the same limit
-                    running = {one: name for one, name in running.items() if not one.cancel()}
-                processes = [one for one in active_children() if one not in others]
-                if not still.reached(processor_time(one.pid or 0 for one in processes)):
+                    running = {
+                        future: name for future, name in running.items() if not future.cancel()
+                    }
+                processes = [child for child in active_children() if child not in others]
+                if not still.reached(processor_time(child.pid or 0 for child in processes)):
                     continue
-                for one in processes:
-                    one.kill()
+                for child in processes:
+                    child.kill()
                 advice = "they were ended; run the command again, which goes on with the rest"
                 raise NoAnswerError("the analyses of the sessions", STILL_S, advice)
 

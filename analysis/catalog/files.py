@@ -112,7 +112,7 @@ class CatalogFiles:
         self._damaged = {}
         return done
 
-    def known(self) -> tuple[dict[str, Scanned], dict[str, int | None]]:
+    def scanned(self) -> tuple[dict[str, Scanned], dict[str, int | None]]:
         """Return the sources that were read and are there, and the version that read each."""
         latest: dict[str, tuple[int, int, int, bool, int | None]] = {}
         for name in self.names("sources"):

@@ -236,16 +236,16 @@ def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
     departed: list[Departure] = []
     serial = analysed["serial"] if "serial" in analysed else pd.Series("", analysed.index)
     names = [analysed["robot"].fillna("(no name)"), serial.fillna("")]
-    for (robot, number), own in analysed.groupby(names, sort=True):
-        history = _history(str(robot), str(number), own.sort_values("start"), joints)
+    for (robot, number), group in analysed.groupby(names, sort=True):
+        history = _history(str(robot), str(number), group.sort_values("start"), joints)
         if isinstance(history, RobotHistory):
             histories.append(history)
         else:
             name = _label(str(robot), str(number))
             few = f"{history} of at least {LEAST_SESSIONS} analysed sessions with the same joints"
             left_out.append(f"{name}: not decided, {few}")
-            of_robot = joints[joints["path"].isin(own["path"])]
-            departed += departures(str(robot), str(number), own.sort_values("start"), of_robot)
+            of_robot = joints[joints["path"].isin(group["path"])]
+            departed += departures(str(robot), str(number), group.sort_values("start"), of_robot)
     departed.sort(key=lambda departure: departure.p)
     answer = _answer(histories, left_out, departed)
     if missing := len(sessions) - len(analysed):
@@ -292,8 +292,8 @@ def _unchanged(history: RobotHistory) -> str:
 
 
 def _correlations(history: RobotHistory) -> str:
-    known = [(memory.quantity, memory.lag_one) for memory in history.memory]
-    listed = ", ".join(f"{name} {rho:.2f}" for name, rho in known if rho is not None)
+    correlations = [(memory.quantity, memory.lag_one) for memory in history.memory]
+    listed = ", ".join(f"{name} {rho:.2f}" for name, rho in correlations if rho is not None)
     return f"; lag-one correlation of sessions: {listed}"
 
 
@@ -313,17 +313,17 @@ def sentence(change: JointChange) -> str:
 
 def _history(robot: str, serial: str, sessions: Frame, joints: Frame) -> RobotHistory | int:
     """Return the history of a robot, or the number of its sessions where they are too few."""
-    own = joints[joints["path"].isin(sessions["path"])]
+    rows = joints[joints["path"].isin(sessions["path"])]
     tables = {
         name: table
-        for name, values in values_of(own, sessions).items()
-        if (table := by_session(own, values)) is not None
+        for name, values in values_of(rows, sessions).items()
+        if (table := by_session(rows, values)) is not None
     }
     if "gain" not in tables or len(tables["gain"]) < LEAST_SESSIONS:
         return len(tables.get("gain", ()))
     ordered = sessions[sessions["path"].isin(tables["gain"].index)].set_index("path")
     tables = {name: table.reindex(ordered.index) for name, table in tables.items()}
-    conditions = conditions_of(own, ordered)
+    conditions = conditions_of(rows, ordered)
     times_s = ordered["start"].astype("int64").to_numpy() / 1e9
     relative = [relative_to_others(table.to_numpy(float), conditions) for table in tables.values()]
     judged = dict(zip(tables, find_change_points(relative, times_s, conditions), strict=True))
@@ -422,12 +422,12 @@ def _trends(sessions: Frame) -> list[ResultTrend]:
     for against, x in _covariates(sessions).items():
         for name in _TRENDS:
             y = sessions[name].to_numpy(float)
-            known = np.isfinite(x) & np.isfinite(y)
-            count = int(np.count_nonzero(known))
-            if count < LEAST_SESSIONS or any(_is_constant(v[known]) for v in (x, y)):
+            finite = np.isfinite(x) & np.isfinite(y)
+            count = int(np.count_nonzero(finite))
+            if count < LEAST_SESSIONS or any(_is_constant(v[finite]) for v in (x, y)):
                 continue
-            tau: Any = stats.kendalltau(x[known], y[known])
-            slope: Any = stats.theilslopes(y[known], x[known], alpha=0.95)
+            tau: Any = stats.kendalltau(x[finite], y[finite])
+            slope: Any = stats.theilslopes(y[finite], x[finite], alpha=0.95)
             trends.append(
                 ResultTrend(
                     name,

@@ -202,7 +202,7 @@ def table_of(kind: str, rows: Sequence[Row]) -> Any:
 
 def session_row(facts: LogFacts) -> Row:
     """Return the columns of a session's row that its file gives."""
-    own = facts.metadata.get("undulog", {})
+    metadata = facts.metadata.get("undulog", {})
     part = facts.metadata.get("undulog.part", {})
     start_ns, end_ns, duration_s = facts.start_ns, facts.end_ns, None
     if start_ns is not None and end_ns is not None:
@@ -210,9 +210,9 @@ def session_row(facts: LogFacts) -> Row:
         if max(start_ns, end_ns) >= 1 << 63:  # beyond what a time can be
             start_ns = end_ns = None
     return {
-        **{name: own.get(name) for name in _OF_SESSION},
-        "software": own.get("undulog"),
-        "seed": _integer(own.get("seed")),
+        **{name: metadata.get(name) for name in _OF_SESSION},
+        "software": metadata.get("undulog"),
+        "seed": _integer(metadata.get("seed")),
         "part": _integer(part.get("part")) or 1,
         "verdict": facts.metadata.get("undulog.health", {}).get("verdict"),
         "start_ns": start_ns,
@@ -222,7 +222,7 @@ def session_row(facts: LogFacts) -> Row:
         "messages": facts.messages,
         "topics": list(facts.topics),
         "damage": facts.damage or None,
-        "metadata": json.dumps(dict(own), sort_keys=True) if own else None,
+        "metadata": json.dumps(dict(metadata), sort_keys=True) if metadata else None,
     }
 
 
@@ -261,8 +261,8 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         "joints": len(result["joints"]),
         "joints_compared": answer["compared"],
         "warnings": list(result["warnings"]),
-        "not_following": [one["joint"] for one in answer["not_following"]],
-        "stand_out": [one["joint"] for one in answer["stand_out"]],
+        "not_following": [fault["joint"] for fault in answer["not_following"]],
+        "stand_out": [deviation["joint"] for deviation in answer["stand_out"]],
         **_estimate("frequency_hz", gait["frequency_hz"], gait["frequency_ci95"]),
     }
     for name in INDICES:

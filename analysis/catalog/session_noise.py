@@ -198,8 +198,8 @@ def _scatter_of(
     even, present = np.ones_like(relative[0]), np.isfinite(relative)
     drawn = _residuals_of(normal, rho, even, present, conditions)
     by_chance = _log_scatter(drawn, rho)
-    known = by_chance[:, np.isfinite(by_chance).all(axis=0)]
-    sampling = float(known.var(axis=0).mean()) if known.size else 0.0
+    complete = by_chance[:, np.isfinite(by_chance).all(axis=0)]
+    sampling = float(complete.var(axis=0).mean()) if complete.size else 0.0
     size = scatter(centred(relative, conditions), rho, sampling)
     return SessionNoise(rho, upper, 0.0, 0.0, sampling, size)
 

@@ -47,18 +47,18 @@ class ResultSource(StoredFile):
     is_log: bool = False
 
 
-def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[ResultSource]:
+def list_sources(store: ObjectStore, earlier: Mapping[str, Scanned]) -> list[ResultSource]:
     """List logs and files that may hold results; none that is known and unchanged is opened.
 
     Args:
-        known: Name of each file that was read to its facts then.
+        earlier: Name of each file that was read to its facts then.
 
     Raises:
         InputFileError: If a folder can't be listed.
     """
     if store.is_local:
         try:
-            return [*_local_results(Path(store.base)), *_local_logs(Path(store.base), known)]
+            return [*_local_results(Path(store.base)), *_local_logs(Path(store.base), earlier)]
         except UndulogError:
             raise
         except OSError as error:
@@ -95,9 +95,9 @@ def source_facts(store: ObjectStore, source: ResultSource) -> LogFacts:
     stored = stored_path(plain)
     check_regular(stored)
     with open(stored, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered
-        own = stream.fileno()
-        size = os.fstat(own).st_size
-        return read_facts(str(plain), size, lambda a, b: os.pread(own, b - a, a))
+        descriptor = stream.fileno()
+        size = os.fstat(descriptor).st_size
+        return read_facts(str(plain), size, lambda a, b: os.pread(descriptor, b - a, a))
 
 
 def _may_be_result(path: PurePath) -> bool:
@@ -112,22 +112,22 @@ def _local_results(base: Path) -> list[ResultSource]:
         folders[:] = [name for name in folders if name != FOLDER]
         paths = (here / name for name in files if name.endswith(_RESULTS))
         sources += [_source(base, path) for path in paths if _may_be_result(path)]
-    return [each for each in sources if each is not None]
+    return [source for source in sources if source is not None]
 
 
-def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[ResultSource]:
+def _local_logs(base: Path, earlier: Mapping[str, Scanned]) -> list[ResultSource]:
     """Return the logs of a folder, and each metadata.yaml there that is of another tool."""
     others: list[ResultSource] = []
 
     def is_recording(folder: Path) -> bool:
-        whole, own = _source(base, folder, is_log=True), _source(base, folder / METADATA)
-        if whole is None or own is None:
+        whole, metadata = _source(base, folder, is_log=True), _source(base, folder / METADATA)
+        if whole is None or metadata is None:
             return False
-        if _is_known(whole, known):
+        if _is_known(whole, earlier):
             return True
-        if not _is_known(own, known) and is_rosbag2(folder):
+        if not _is_known(metadata, earlier) and is_rosbag2(folder):
             return True
-        others.append(own)
+        others.append(metadata)
         return False
 
     paths = dict.fromkeys(log_paths(base, is_recording))
@@ -135,8 +135,8 @@ def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[ResultSource]:
     return [*(log for log in logs if log is not None), *others]
 
 
-def _is_known(source: ResultSource, known: Mapping[str, Scanned]) -> bool:
-    return known.get(source.name, ())[:2] == (source.size, source.modified_ns)
+def _is_known(source: ResultSource, earlier: Mapping[str, Scanned]) -> bool:
+    return earlier.get(source.name, ())[:2] == (source.size, source.modified_ns)
 
 
 def _source(base: Path, path: Path, *, is_log: bool = False) -> ResultSource | None:
@@ -153,11 +153,11 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> ResultSource | N
     try:
         at = wal_folder(path) if is_log and is_wal_alone(path) else stored_path(path)
         facts = at.stat()
-        own = [facts]
+        parts = [facts]
         if S_ISDIR(facts.st_mode):
             with os.scandir(at) as entries:
-                own = [entry.stat() for entry in entries if entry.is_file()] or own
+                parts = [entry.stat() for entry in entries if entry.is_file()] or parts
     except FileNotFoundError:
         return None
-    size, modified_ns = sum(each.st_size for each in own), max(each.st_mtime_ns for each in own)
+    size, modified_ns = sum(part.st_size for part in parts), max(part.st_mtime_ns for part in parts)
     return ResultSource(name, size, modified_ns, is_log)

@@ -45,7 +45,7 @@ def analyse(
     period: float | None = None,
     robot: str | None = None,
     null: Path | None = None,
-    each: bool = False,
+    separately: Annotated[bool, Parameter(name="--each")] = False,
     force: bool = False,
 ) -> int:
     """Compute gain and lag, energy and spread over the segments, each with its interval.
@@ -81,20 +81,20 @@ def analyse(
             waves are measured at it.
         robot: Description of the robot of a log without one, a name or a TOML file.
         null: Model of identical modules (see `undulog sim null`) to hold the one session to.
-        each: Analyse several sessions one by one instead of as one experiment.
+        separately: Analyse several sessions one by one instead of as one experiment.
         force: Replace the output file if it exists.
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
     options = chosen(start, stop, topics, reference_topic, excitation_topic, period=period)
     if any(is_data_set(file) for file in files):
-        _check_data_set(files, options, [null, robot, each or None])
+        _check_data_set(files, options, [null, robot, separately or None])
         return show_data_set(files[0], output, csv, force=force, as_json=json)
     paths = sessions_of(files)
     if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
     check_result_file(output, force=force)
-    one_by_one = len(paths) > 1 and (each or not are_as_given(paths, files))
+    one_by_one = len(paths) > 1 and (separately or not are_as_given(paths, files))
     if csv is not None:
         from ..present.data_frames import check_csv
 
@@ -184,7 +184,7 @@ def _table(
 ) -> int:
     """Analyse sessions one by one and print a table, or a list of results."""
     analysis: list[Analysis] = []
-    work = partial(_line, options=options, robot=robot, found=None if csv is None else analysis)
+    work = partial(_line, options=options, robot=robot, analyses=None if csv is None else analysis)
     lines = each_session(paths, "analyse", work)
     if csv is not None:
         from ..present.data_frames import write_csv
@@ -197,7 +197,7 @@ def _table(
 
 
 def _line(
-    file: Path, *, options: Options, robot: str | None, found: list[Analysis] | None = None
+    file: Path, *, options: Options, robot: str | None, analyses: list[Analysis] | None = None
 ) -> SessionLine:
     from undulog.capture import Session
 
@@ -205,8 +205,8 @@ def _line(
 
     with Session.open(file, robot=robot) as session:
         analysis = analyse_session(session, options)
-    if found is not None:
-        found.append(analysis)
+    if analyses is not None:
+        analyses.append(analysis)
     return line_of(analysis)
 
 
@@ -214,10 +214,10 @@ def line_of(analysis: Analysis) -> SessionLine:
     """Return the line of a session in a table."""
     from ..results import formats
 
-    answer, known = analysis.answer, analysis.gait.frequency_hz.value is not None
+    answer, periodic = analysis.answer, analysis.gait.frequency_hz.value is not None
     return SessionLine(
         robot=analysis.session.robot or "",
-        gait=formats.gait_frequency(analysis.gait) if known else "",
+        gait=formats.gait_frequency(analysis.gait) if periodic else "",
         verdict=answer.verdict,
         sentence=answer.sentence,
         facts=analysis.to_dict(),

@@ -79,12 +79,12 @@ def catalog(
         check_output(output, _ENDINGS, why, force=force)
     from ..catalog.catalog import Catalog
 
-    found = Catalog(where)
+    catalogue = Catalog(where)
     report, faults, complete = None, dict[str, str](), True
     with interruptible() as stop:
         if scan:
             with progress("catalog", total=1) as bar:
-                report = found.scan(
+                report = catalogue.scan(
                     stop=stop, on_read=lambda k, n: bar.update(k / n, f"{k} of {n}")
                 )
             complete = report.complete
@@ -92,13 +92,13 @@ def catalog(
                 complain(text)
         if analyse and complete:
             with progress("analyse", total=1) as bar:
-                faults = found.analyse(
+                faults = catalogue.analyse(
                     workers=workers,
                     stop=stop,
                     on_done=lambda k, n: bar.update(k / n, f"{k} of {n}"),
                 )
             complete = not stop.requested
-    rows = found.sql(sql) if sql else found.find(find, joints=joints)
+    rows = catalogue.sql(sql) if sql else catalogue.find(find, joints=joints)
     if output is not None:
         _write(rows, output)
     for name, why in faults.items():

@@ -392,7 +392,11 @@ def multisine(
         _write_band(like, output, band, options, numbers=numbers, topics=topics, as_json=json)
         return
     if options != _DEFAULT:
-        given = [one.name for one in fields(options) if getattr(options, one.name) != one.default]
+        given = [
+            option.name
+            for option in fields(options)
+            if getattr(options, option.name) != option.default
+        ]
         names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError(f"{names}: only with --band, the lowest and the highest frequency")
     tones = 3 if tones is None else tones

@@ -83,27 +83,27 @@ def predict(
         coupling = coupling_of_result(first)
     else:
         coupling = _local(experiment_of(files, options, "predict").coupling)
-    found = closed_loop(coupling, eps, age_s=age, kick=turned, until_s=until)
+    loop = closed_loop(coupling, eps, age_s=age, kick=turned, until_s=until)
     if output is not None:
-        write_text(output, dumps(asdict(found), indent=2, allow_nan=False) + "\n")
+        write_text(output, dumps(asdict(loop), indent=2, allow_nan=False) + "\n")
     if json:
-        emit_json(asdict(found))
+        emit_json(asdict(loop))
         return
-    show(lambda width, color: render_loop(found, width=width, color=color), output)
+    show(lambda width, color: render_loop(loop, width=width, color=color), output)
 
 
 def _kicks(words: Sequence[str]) -> dict[str, float]:
     """Parse joints and angles of ``JOINT=RAD``."""
-    found: dict[str, float] = {}
+    kicks: dict[str, float] = {}
     for word in words:
         name, equals, angle = word.rpartition("=")
         try:
-            found[name] = float(angle)
+            kicks[name] = float(angle)
         except ValueError:
             equals = ""
         if not name or not equals:
             raise UsageError(f"--kick {word}: expected JOINT=RAD, e.g. joint05=0.2")
-    return found
+    return kicks
 
 
 def coupling_of_result(file: Path) -> LocalCoupling:
@@ -187,12 +187,12 @@ def compensate(
         from ..plan.compensate import compensation
         from ..plan.runs import PlannedRun
 
-        found, amplitude = compensation(
+        result, amplitude = compensation(
             coupling, base, session.robot, driven, target_gain=gain, keep=keep
         )
         run = PlannedRun("compensated", amplitude, {"kind": "compensated"})
-        notes = _notes(found, coupling.base.frequency_hz if coupling.base else math.nan, base)
-        return Planned((run,) * runs, settle, measure, notes=notes, result=asdict(found))
+        notes = _notes(result, coupling.base.frequency_hz if coupling.base else math.nan, base)
+        return Planned((run,) * runs, settle, measure, notes=notes, result=asdict(result))
 
     write_sessions("compensate", like, output, design, topics, as_json=json)
 
@@ -245,9 +245,9 @@ def _notes(compensation: Compensation, kicked_hz: float, base: BaseGait) -> tupl
         for joint in compensation.joints
         if joint.lacking > 0
     ]
-    known = [joint for joint in compensation.joints if joint.margin is not None]
-    if known:
-        least = min(known, key=lambda one: one.margin or 0.0)
+    limited = [joint for joint in compensation.joints if joint.margin is not None]
+    if limited:
+        least = min(limited, key=lambda joint: joint.margin or 0.0)
         notes.append(
             f"The least margin is that of {least.name}: {_percent(least.margin)} of its "
             f"{least.limited_by} limit is left"

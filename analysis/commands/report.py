@@ -32,7 +32,7 @@ def report(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     pdf: Path | None = None,
     browser: str | None = None,
-    each: bool = False,
+    separately: Annotated[bool, Parameter(name="--each")] = False,
     catalog: str | None = None,
     find: Annotated[str, Parameter(name="--where")] = "",
     start: float | None = None,
@@ -76,7 +76,7 @@ def report(
             Chromium, Chrome or Edge, which runs without network.
         browser: Name or path of the browser that prints; else that of UNDULOG_BROWSER, or the first
             on the path.
-        each: Report on several sessions one by one on one page instead of as one experiment.
+        separately: Report on several sessions one by one on one page instead of as one experiment.
         catalog: Folder or URL of sessions to compare over time, instead of files; those without
             results are analysed first.
         find: Condition on the sessions of the catalogue, as for `undulog catalog`.
@@ -109,7 +109,7 @@ def report(
             made = _fleet(catalog, find, outputs.first)
         elif not several:
             made = _one(paths[0], options, robot)
-        elif each or not are_as_given(paths, files):
+        elif separately or not are_as_given(paths, files):
             made = _one_by_one(paths, options, robot)
         else:
             made = _several(paths, options, robot)

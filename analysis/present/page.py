@@ -59,9 +59,9 @@ from .experiment_view import experiment_view
 from .page_tables import (
     LEVEL_NOTE,
     digits,
+    escaped,
     estimate,
     grid,
-    known,
     number,
     p_value,
     sentence,
@@ -221,7 +221,7 @@ def environment() -> Environment:
     for of in (*shared, softer, typeset, digits, sentence):
         made.filters[of.__name__] = of
     made.filters.update(decimals=formats.decimals_for, again=_commands_to_reproduce)
-    made.globals.update(tables=tables, responses=response_tables, grid=grid, known=known)
+    made.globals.update(tables=tables, responses=response_tables, grid=grid, escaped=escaped)
     made.globals.update(num=number, est=estimate, p=p_value)
     script = _script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

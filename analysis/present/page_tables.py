@@ -207,7 +207,7 @@ def _shown(cell: Cell) -> Markup:
         case PValue():
             return p_value(cell)
         case _:
-            return known(cell)
+            return escaped(cell)
 
 
 def number(value: float | None, decimals: int) -> Markup:
@@ -233,7 +233,7 @@ def p_value(p: float | None) -> Markup:
     return Markup('<data value="{}">{}</data>').format(p, formats.p_value(p).replace(" ", NO_BREAK))
 
 
-def known(value: object) -> Markup:
+def escaped(value: object) -> Markup:
     """Return a value as escaped text, or a dash for None."""
     return _NOT_COMPUTED if value is None else escape(plain(str(value)))
 
