@@ -25,6 +25,7 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
+from ..estimators.nonnegative import nonnegative_least_squares
 from ..estimators.series import Series, clean
 from ..results.answer import Note
 from ..results.body import GroundContact, LinkContact
@@ -77,40 +78,38 @@ def link_loads(
         Loads over the mean weight of a link, shape (n, m + 1), and the root mean square of the
         residuals, each over its standard error.
     """
-    from scipy.optimize import nnls  # only for robots with torques
-
     mass = np.array([link.mass for link in robot.links])
     radius = np.array([link.radius for link in robot.links])
     weight = GRAVITY * float(mass.mean())
     length = float(np.mean([link.length for link in robot.links]))
-    m = len(robot.joints)
+    n, m = angles.shape
     errors = np.repeat([_TORQUE * length, _FORCE, _MOMENT * length], [m, 3, 3]) * weight
-    prior = np.eye(m + 1) / _EVEN
     yaw = np.array([[joint.plane is Plane.HORIZONTAL] for joint in robot.joints])
     half = np.array([[link.length / 2] for link in robot.links])
     centres, turns = link_poses(robot, np.zeros(3), np.eye(3), angles)
-    loads, squares = np.zeros((len(angles), m + 1)), 0.0
-    for k, vertical in enumerate(up):
-        turn, middle = turns[k, :-1], mass @ centres[k] / mass.sum()
-        pivot = centres[k, :-1] - half[:-1] * turn[:, :, 0]
-        axis = np.where(yaw, turn[:, :, 2], turn[:, :, 1])
-        ground = _moments(centres[k] - radius[:, None] * vertical, pivot, axis, middle)
-        level = np.linalg.svd(vertical[None])[2][1:]
-        slip = np.einsum("rni,ti->rnt", ground, level).reshape(m + 6, -1)
-        body = _moments(centres[k], pivot, axis, middle)
-        weights = -GRAVITY * np.einsum("rni,i,n->r", body, vertical, mass)
-        asked = np.concatenate([torques[k], np.zeros(6)]) - weights
-        covariance: FloatArray = np.diag(errors**2) + (_FRICTION * weight) ** 2 * slip @ slip.T
-        rows: FloatArray = np.column_stack([weight * (ground @ vertical), asked])
-        # SciPy's triangular solver takes twenty times as long: it starts threads for so little.
-        rows = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), rows), dtype=np.float64)
-        matrix = np.vstack([rows[:, :-1], prior])
-        loads[k] = nnls(
-            matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]), maxiter=30 * (m + 1)
-        )[0]
-        left = rows[:, -1] - rows[:, :-1] @ loads[k]
-        squares += float(left @ left) / left.size
-    return loads, (squares / max(len(up), 1)) ** 0.5
+    middle = mass @ centres / mass.sum()
+    pivot = centres[:, :-1] - half[:-1] * turns[:, :-1, :, 0]
+    axis = np.where(yaw, turns[:, :-1, :, 2], turns[:, :-1, :, 1])
+    ground = _moments(centres - radius[:, None] * up[:, None], pivot, axis, middle)
+    lift = np.einsum("krni,ki->krn", ground, up)
+    slip = (ground - lift[..., None] * up[:, None, None]).reshape(n, m + 6, -1)
+    body = _moments(centres, pivot, axis, middle)
+    weights = -GRAVITY * np.einsum("krni,ki,n->kr", body, up, mass)
+    measured = np.concatenate([torques, np.zeros((n, 6))], axis=1) - weights
+    covariance: FloatArray = np.diag(errors**2) + (_FRICTION * weight) ** 2 * (
+        slip @ slip.transpose(0, 2, 1)
+    )
+    rows = np.concatenate([weight * lift, measured[..., None]], axis=2)
+    # SciPy's triangular solver takes twenty times as long: it starts threads for so little.
+    rows = np.linalg.solve(np.linalg.cholesky(covariance), rows)
+    matrix, right = rows[..., :-1], rows[..., -1]
+    transposed = matrix.transpose(0, 2, 1)
+    loads = nonnegative_least_squares(
+        transposed @ matrix + np.eye(m + 1) / _EVEN**2,
+        (transposed @ right[..., None])[..., 0] + 1 / _EVEN**2,
+    )
+    left = right - (matrix @ loads[..., None])[..., 0]
+    return loads, float(np.mean(np.square(left))) ** 0.5 if n else 0.0
 
 
 def _moments(
@@ -119,19 +118,19 @@ def _moments(
     """Return the joints' torques against unit forces on the links, and the body's balances.
 
     Args:
-        point: Where the forces act, one a link [m], shape (m + 1, 3).
-        pivot: Of the joints [m], shape (m, 3).
-        axis: Of the joints, shape (m, 3).
-        middle: Point of the body's moments [m], shape (3,).
+        point: Where the forces act, one a link [m], shape (n, m + 1, 3).
+        pivot: Of the joints [m], shape (n, m, 3).
+        axis: Of the joints, shape (n, m, 3).
+        middle: Point of the body's moments [m], shape (n, 3).
 
     Returns:
-        Torques [m], sum [1] and moment [m] per unit force, shape (m + 6, m + 1, 3).
+        Torques [m], sum [1] and moment [m] per unit force, shape (n, m + 6, m + 1, 3).
     """
-    behind = np.arange(len(point)) > np.arange(len(pivot))[:, None]
-    about = np.cross(axis[:, None], point - pivot[:, None]) * behind[..., None]
-    whole = np.cross(np.eye(3)[:, None], point - middle)
+    behind = np.arange(point.shape[1]) > np.arange(pivot.shape[1])[:, None]
+    about = np.cross(axis[:, :, None], point[:, None] - pivot[:, :, None]) * behind[..., None]
+    whole = np.cross(np.eye(3)[:, None], (point - middle[:, None])[:, None])
     force = np.broadcast_to(np.eye(3)[:, None], whole.shape)
-    return np.concatenate([-about, force, whole])
+    return np.concatenate([-about, force, whole], axis=1)
 
 
 def means_between(t_s: FloatArray, values: FloatArray, edges_s: FloatArray) -> FloatArray:

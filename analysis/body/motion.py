@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import NS, BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
@@ -314,21 +314,19 @@ def head_poses(session: SessionView, head: str, span: Span, beyond: int = 0) -> 
     """
     start_ns = span.origin_ns + round(span.start_s * NS)
     stop_ns = span.origin_ns + round(span.stop_s * NS)
-    _, tables = session.columns({}, {ODOMETRY_TOPIC: [_CHILD, *_POSE]})
-    table = tables[ODOMETRY_TOPIC]
-    at_ns: IntArray = table.index.to_numpy(dtype=np.int64)
-    i, j = np.searchsorted(at_ns, (start_ns, stop_ns))
+    logged = session.arrays({ODOMETRY_TOPIC: [_CHILD, *_POSE]})[ODOMETRY_TOPIC]
+    i, j = np.searchsorted(logged.t_ns, (start_ns, stop_ns))
     inner = slice(max(int(i) - beyond, 0), int(j) + beyond)
-    table, t_ns = table.iloc[inner], at_ns[inner]
-    if table.empty or not set(_POSE) <= set(table.columns):
+    t_ns, fields = logged.t_ns[inner], logged.values
+    if not t_ns.size or not set(_POSE) <= set(fields):
         raise DataError(f"{ODOMETRY_TOPIC} has no poses within the analysed window")
-    children = {str(name) for name in table[_CHILD].unique()} - {""}
+    children = {str(name) for name in set(fields[_CHILD][inner].tolist())} - {""}
     if children - {head}:
         raise DataError(
             f"{ODOMETRY_TOPIC} gives the pose of {', '.join(sorted(children))}, not of the head "
             f"link {head}"
         )
-    pose = np.stack([table[name].to_numpy(dtype=np.float64) for name in _POSE])
+    pose = np.stack([fields[name][inner].astype(np.float64) for name in _POSE])
     inside: BoolArray = np.all(np.isfinite(pose), axis=0)
     inside[1:] &= np.diff(t_ns) > 0
     if np.count_nonzero(inside) < 16:

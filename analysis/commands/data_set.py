@@ -25,9 +25,11 @@ READING = 0.5
 
 def is_data_set(path: Path) -> bool:
     """Return whether a path is the folder of a LeRobot data set."""
+    if not path.is_dir():
+        return False
     from undulog.capture.exchange.lerobot_import import is_lerobot
 
-    return path.is_dir() and is_lerobot(path)
+    return is_lerobot(path)
 
 
 def analyse_data_set(folder: Path) -> EpisodesResult:

@@ -125,15 +125,15 @@ def _lean(session: SessionView, windows: Sequence[Window]) -> float:
 
 def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) -> float:
     """Lean of the link that carries one accelerometer; its specific force is gravity's opposite."""
-    table = session.table(sensor.topic)
-    t_s = (table.index.to_numpy() - session.start_ns) * 1e-9
+    columns = [f"linear_acceleration.{axis}" for axis in "xyz"]
+    logged = session.arrays({sensor.topic: columns})[sensor.topic]
+    t_s = (logged.t_ns - session.start_ns) * 1e-9
     inside = np.zeros(len(t_s), dtype=np.bool_)
     for window in windows:
         inside |= (t_s >= window.start_s) & (t_s < window.stop_s)
-    columns = [f"linear_acceleration.{axis}" for axis in "xyz"]
-    if not inside.any() or not set(columns) <= set(table.columns):
+    if not inside.any() or not set(columns) <= set(logged.values):
         return math.nan
-    mean = table[columns].to_numpy(dtype=np.float64)[inside].mean(axis=0)
+    mean = np.stack([logged.values[name][inside] for name in columns], axis=1).mean(axis=0)
     if not np.isfinite(mean).all():
         return math.nan
     # First and third row of Rz(yaw) Ry(pitch) Rx(roll): the link's x and z.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from .exposure import Exposure
@@ -173,7 +173,8 @@ def _excess_noise(left: FloatArray, weights: FloatArray, exposure: Exposure) -> 
             noise[k] = 0.0
             continue
         noise[k] = np.where(remaining[k] > 0, noise[k] - _middle(noise[k, remaining[k] > 0]), 0.0)
-    lasting = median_filter(noise, (1, 2 * REST_ERRORS + 1), mode="nearest")
+    around = np.pad(noise, ((0, 0), (REST_ERRORS, REST_ERRORS)), mode="edge")
+    lasting = np.median(sliding_window_view(around, 2 * REST_ERRORS + 1, axis=1), axis=2)
     return np.exp(np.maximum(lasting, 0.0))
 
 

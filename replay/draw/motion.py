@@ -159,8 +159,9 @@ def read_head(
     child, link = str(first.child_frame_id), robot.links[0].name
     if child != link:
         warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {link}")
-    (table,) = session.columns({}, {"/odom": POSE})[1].values()
-    return tracked_head(table.index.to_numpy(dtype=np.int64), table[POSE].to_numpy(np.float64))
+    logged = session.arrays({"/odom": POSE})["/odom"]
+    pose = np.stack([logged.values[name] for name in POSE], axis=1).astype(np.float64)
+    return tracked_head(logged.t_ns, pose)
 
 
 def still_head(t_ns: IntArray) -> HeadPath:

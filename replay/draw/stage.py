@@ -94,11 +94,11 @@ def read_ranges(
     distance = np.full((at_ns.size, len(sensors)), np.nan, dtype=np.float32)
     for first in range(0, len(sensors), _AT_ONCE):
         some = sensors[first : first + _AT_ONCE]
-        tables = session.columns({}, {sensor.topic: ["range"] for sensor in some})[1]
+        logged = session.arrays({sensor.topic: ["range"] for sensor in some})
         for i, sensor in enumerate(some, start=first):
-            table = tables.pop(sensor.topic)
-            t_ns, values = table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(np.float64)
-            distance[:, i] = hold(*ordered(t_ns, values), at_ns)
+            fields = logged.pop(sensor.topic)
+            values = fields.values["range"].astype(np.float64)
+            distance[:, i] = hold(*ordered(fields.t_ns, values), at_ns)
         session.forget()
     return distance
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.definitions import newer_contract
 from ..messages.frames import FrameArray, join_batches
+from .field_arrays import FieldArrays, group_arrays, joined
 from .joint_states import JointReader
 from .joint_topics import JointTopicFinder, JointTopics, check_joints
 from .sample_times import JointSignals, StampClock
@@ -138,6 +139,18 @@ class OpenLog:
         """Read tables in one pass, for a window of log times; see :meth:`.SessionView.table`."""
         return self._as_tables(topics, self.topics.read(topics, window_ns))
 
+    def arrays(
+        self, topics: Mapping[str, Sequence[str] | None], window_ns: Window
+    ) -> dict[str, FieldArrays]:
+        """Read fields in one pass, for a window of log times; see :meth:`.SessionView.arrays`."""
+        messages = self.topics.read(topics, window_ns)
+        read: dict[str, FieldArrays] = {}
+        for topic in topics:
+            shift_ns = self._clock.shift_ns(topic)
+            groups = self._groups(topic, messages.pop(topic))
+            read[topic] = joined([group_arrays(group, shift_ns) for group in groups])
+        return read
+
     def columns(
         self,
         joints: Mapping[str, Sequence[str]],
@@ -203,18 +216,8 @@ def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """Return one layout group as a table."""
     import pandas as pd
 
-    strings = group.strings.items()
-    columns: dict[str, Any] = {k: np.full(len(group), text, dtype=object) for k, text in strings}
-    for path in group.paths:
-        values = group.values(path)
-        if group.layout.leaves[path].is_array:
-            columns |= {f"{path}[{k}]": values[:, k] for k in range(values.shape[1])}
-        else:
-            columns[path] = values[:, 0]
-    t_ns = group.stamps()
-    if group.is_stamped and (shift_ns or not t_ns.all()):
-        t_ns = np.where(t_ns == 0, group.times(), t_ns + shift_ns)
-    return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"), copy=False)
+    arrays = group_arrays(group, shift_ns)
+    return pd.DataFrame(arrays.values, index=pd.Index(arrays.t_ns, name="t_ns"), copy=False)
 
 
 class ViewedSession:

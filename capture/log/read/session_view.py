@@ -23,6 +23,8 @@ from .sample_times import JointSignals
 if TYPE_CHECKING:
     import pandas as pd
 
+    from .field_arrays import FieldArrays
+
 _Found = TypeVar("_Found")
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
@@ -329,6 +331,32 @@ class SessionView(ViewedSession):
             DataError: If its type can't be read.
         """
         return self._tables({topic: None}, (start_ns, stop_ns))[topic]
+
+    def arrays(
+        self,
+        topics: Mapping[str, Sequence[str] | None],
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> dict[str, FieldArrays]:
+        """Return fields of some topics, as :meth:`table` does, as plain arrays.
+
+        Args:
+            topics: Topic to field paths, e.g. ``{"/sonar": ["range"]}``; None for all of a topic.
+            start_ns: First log time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            By topic.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its type can't be read.
+        """
+        self._on_read()
+        logged = {self._logged(topic): paths for topic, paths in topics.items()}
+        read = self._log.arrays(logged, self._within(start_ns, stop_ns))
+        return {topic: read[self._logged(topic)] for topic in topics}
 
     def columns(
         self,

@@ -6,6 +6,7 @@ import pytest
 from support.written_sessions import write_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import MissingChannelError
+from undulog.capture.log.read.field_arrays import FieldArrays, joined
 
 START_S, STOP_S = 1.0, 2.5
 POSE_X = "pose.pose.position.x"
@@ -94,3 +95,25 @@ def test_a_view_reads_through_the_open_file_and_shares_its_warnings(session):
     assert view.robot is session.robot
     assert view.warnings == session.warnings
     assert view.session_id == session.session_id
+
+
+def test_arrays_hold_what_the_table_holds(session, limits):
+    view = session.view(**limits, rename={"/pose": "/odom"})
+    for read, topic in ((session, "/odom"), (view, "/pose")):
+        arrays, table = read.arrays({topic: None})[topic], read.table(topic)
+        assert arrays.t_ns.tolist() == table.index.tolist()
+        assert list(arrays.values) == table.columns.tolist()
+        for path, values in arrays.values.items():
+            assert values.tolist() == table[path].tolist()
+    with pytest.raises(MissingChannelError):
+        session.arrays({"/none": None})
+
+
+def test_arrays_of_several_layouts_are_in_order_of_time():
+    first = FieldArrays(np.array([10, 30]), {"x": np.array([1.0, 3.0]), "n": np.array([7, 8])})
+    second = FieldArrays(np.array([20, 30]), {"x": np.array([2.0, 4.0])})
+    both = joined([first, second])
+    assert both.t_ns.tolist() == [10, 20, 30, 30]
+    assert both.values["x"].tolist() == [1.0, 2.0, 3.0, 4.0]
+    np.testing.assert_array_equal(both.values["n"], [7, np.nan, 8, np.nan])
+    assert joined([]).t_ns.size == 0
