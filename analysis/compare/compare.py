@@ -52,20 +52,26 @@ def broken_joints(
         The joints in the order of the answers, those that do not follow first.
     """
     joints: list[BrokenJoint] = []
-    for side, own, other in (("B", b, a), ("A", a, b)):
-        answers = [one.analysis.answer for one in own]
-        elsewhere = {each.joint for one in other for each in one.analysis.answer.not_following}
-        for fault in _first([each for answer in answers for each in answer.not_following]):
+    for side, sessions, other in (("B", b, a), ("A", a, b)):
+        answers = [session.analysis.answer for session in sessions]
+        elsewhere = {
+            fault.joint for session in other for fault in session.analysis.answer.not_following
+        }
+        for fault in _first([fault for answer in answers for fault in answer.not_following]):
             if fault.joint not in elsewhere:
                 text = f"in {side} {fault_in_words(fault)}"
                 joints.append(BrokenJoint(fault.joint, side, fault.kinds, text))
-        known = {each.name for each in joints}
-        stand_out = [each for answer in answers for each in answer.stand_out]
-        for each in _first([each for each in stand_out if each.quantity == "offset"]):
-            if each.joint not in known | elsewhere and _moved(each.joint, own, other):
-                text = f"in {side} {plain(each.joint)} has {deviation_in_words(each)}"
-                joints.append(BrokenJoint(each.joint, side, (), text))
-    return tuple(sorted(joints, key=lambda each: not each.kinds))
+        names = {joint.name for joint in joints}
+        stand_out = [deviation for answer in answers for deviation in answer.stand_out]
+        for deviation in _first(
+            [deviation for deviation in stand_out if deviation.quantity == "offset"]
+        ):
+            if deviation.joint not in names | elsewhere and _moved(
+                deviation.joint, sessions, other
+            ):
+                text = f"in {side} {plain(deviation.joint)} has {deviation_in_words(deviation)}"
+                joints.append(BrokenJoint(deviation.joint, side, (), text))
+    return tuple(sorted(joints, key=lambda joint: not joint.kinds))
 
 
 def _moved(
@@ -73,7 +79,8 @@ def _moved(
 ) -> bool:
     """Return whether a joint's mean differs between the sides, too: both may share a zero."""
     sides = [
-        [one.offsets[joint] for one in side if joint in one.offsets] for side in (sessions, other)
+        [session.offsets[joint] for session in side if joint in session.offsets]
+        for side in (sessions, other)
     ]
     if not all(sides):
         return True
@@ -87,8 +94,8 @@ _Entry = TypeVar("_Entry", NotFollowing, StandOut)
 def _first(several: Sequence[_Entry]) -> list[_Entry]:
     """Return the first entry of each joint."""
     entries: dict[str, _Entry] = {}
-    for each in several:
-        entries.setdefault(each.joint, each)
+    for entry in several:
+        entries.setdefault(entry.joint, entry)
     return list(entries.values())
 
 
@@ -128,14 +135,14 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
                 f"{run.label} has no gait, so there is no gait phase to align it by, and others "
                 "have one: compare sessions with a gait, or sessions without"
             )
-    for side, own in (("A", a), ("B", b)):
-        _refuse_copies([(run.label, run.ratio) for run in own], side)
+    for side, side_runs in (("A", a), ("B", b)):
+        _refuse_copies([(run.label, run.ratio) for run in side_runs], side)
     joints = list(dict.fromkeys(name for run in runs for name in run.names))
     answered = [
         {name for name, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
         for run in runs
     ]
-    names = tuple(name for name in joints if all(name in known for known in answered))
+    names = tuple(name for name in joints if all(name in run_joints for run_joints in answered))
     if not names:
         raise DataError(
             f"no joint has gain and lag in all sessions: {a[0].label} drives "
@@ -143,7 +150,9 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
         )
     left_out = {
         name: "no gain and lag in "
-        + ", ".join(r.label for r, known in zip(runs, answered, strict=True) if name not in known)
+        + ", ".join(
+            r.label for r, run_joints in zip(runs, answered, strict=True) if name not in run_joints
+        )
         for name in joints
         if name not in names
     }
@@ -170,18 +179,25 @@ def align_commanded(
         DataError: If no joint can be compared, only some sessions have a gait, or the gaits differ
             and that is not allowed.
     """
-    sides = [[one.analysis.tracking for one in side] for side in (a, b)]
-    known = [
-        {place for quantity, place in one.estimates if quantity == "delay"} for one in (*a, *b)
+    sides = [[session.analysis.tracking for session in side] for side in (a, b)]
+    with_delay = [
+        {place for quantity, place in session.estimates if quantity == "delay"}
+        for session in (*a, *b)
     ]
-    tracked = [joint.joint for joint in sides[0][0] if all(joint.joint in own for own in known)]
-    if tracked and not any(one.run.names for one in (*a, *b)):
-        for side, own in (("A", a), ("B", b)):
-            _refuse_copies([(one.run.label, _numbers(one, tracked)) for one in own], side)
+    tracked = [
+        joint.joint for joint in sides[0][0] if all(joint.joint in names for names in with_delay)
+    ]
+    if tracked and not any(session.run.names for session in (*a, *b)):
+        for side, sessions in (("A", a), ("B", b)):
+            _refuse_copies(
+                [(session.run.label, _numbers(session, tracked)) for session in sessions], side
+            )
         aligned = Alignment((), {}, None)
     else:
-        aligned = align([one.run for one in a], [one.run for one in b], any_gait=any_gait)
-    some = {name for own in known for name in own} - {*tracked, *aligned.names}
+        aligned = align(
+            [session.run for session in a], [session.run for session in b], any_gait=any_gait
+        )
+    some = {name for names in with_delay for name in names} - {*tracked, *aligned.names}
     left_out = dict.fromkeys(sorted(some), "no gain, lag and offset in all sessions")
     return replace(
         aligned,
@@ -209,14 +225,16 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     """
     if (different := other_frequency(run, model)) is not None:
         return f"{run.label} has {different[0]} Hz, {model.label} {different[1]} Hz"
-    own, other = (
-        np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
+    command, other = (
+        np.array([gait.command[gait.names.index(name)] for name in names]) for gait in (run, model)
     )
-    groups, others = ([one.group[one.names.index(name)] for name in names] for one in (run, model))
+    groups, others = (
+        [gait.group[gait.names.index(name)] for name in names] for gait in (run, model)
+    )
     if groups != others:
         return f"{run.label} has other joints than {model.label} at one frequency"
     members = [np.flatnonzero(np.array(groups) == group) for group in set(groups)]
-    if (off := command_difference(own, other, members)) is None:
+    if (off := command_difference(command, other, members)) is None:
         return None
     worst, percent, degrees = off
     return (
@@ -328,28 +346,28 @@ def compare_fitted(
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
     estimates = [estimates_of(side, keys, about) for side in (a, b)]
-    first, second, found = differ(estimates[0], estimates[1], design)
-    rate_rad_s = fastest_rad_s(one.analysis.tracking for one in (*a, *b)) or 1.0
+    first, second, differences = differ(estimates[0], estimates[1], design)
+    rate_rad_s = fastest_rad_s(session.analysis.tracking for session in (*a, *b)) or 1.0
     decided = decide(
-        *(keys, first, second, found, choices.margins), before=before, rate_rad_s=rate_rad_s
+        *(keys, first, second, differences, choices.margins), before=before, rate_rad_s=rate_rad_s
     )
     partial = _partial(aligned, " by their phase" if free else "")
     _warn(a, b, design, every_warning.append)
     moved = {offset.place for offset in moved_offsets(decided)}
     # What stands off on one side is stated by the difference, which has an interval.
     broken = tuple(joint for joint in broken_joints(a, b) if joint.kinds or joint.name not in moved)
-    alike = one_robot([one.facts for one in (*a, *b)]) and aligned.commands_differ is None
+    alike = one_robot([session.facts for session in (*a, *b)]) and aligned.commands_differ is None
     verb = MOVED if alike and aligned.gaits_differ is None else DIFFERS
     verdict, sentence = answer_of(decided, partial is not None, broken, verb)
     return Comparison(
         answer=sentence,
         verdict=verdict,
         design=design,
-        a=tuple(one.analysis.session for one in a),
-        b=tuple(one.analysis.session for one in b),
+        a=tuple(session.analysis.session for session in a),
+        b=tuple(session.analysis.session for session in b),
         broken=broken,
         partial=partial,
-        changed=changes([one.facts for one in a], [one.facts for one in b]),
+        changed=changes([session.facts for session in a], [session.facts for session in b]),
         **vars(decided),
         phase_rad=tuple(phases_rad().tolist()),
         waveforms=_waveforms(a, b, aligned.names, design),
@@ -364,8 +382,8 @@ def _without_commands(a: Sequence[ComparedSession], b: Sequence[ComparedSession]
     Raises:
         DataError: If only some of them have.
     """
-    commanded = [one for one in (*a, *b) if one.commanded]
-    free = [one for one in (*a, *b) if not one.commanded]
+    commanded = [session for session in (*a, *b) if session.commanded]
+    free = [session for session in (*a, *b) if not session.commanded]
     if commanded and free:
         without, other = free[0].run.label, commanded[0].run.label
         raise DataError(
@@ -389,19 +407,21 @@ def _align_motions(
         DataError: If a session has no periodic motion, or no joint moves in all of them.
     """
     motions: list[PeriodicMotion] = []
-    for one in (*a, *b):
-        if one.motion is None:
+    for session in (*a, *b):
+        if session.motion is None:
             raise DataError(
-                f"{one.run.label} has no logged commands and no periodic motion, so there is "
+                f"{session.run.label} has no logged commands and no periodic motion, so there is "
                 "nothing to compare; choose a part that is periodic (--start, --stop)"
             )
-        motions.append(one.motion)
-    for side, own in (("A", motions[: len(a)]), ("B", motions[len(a) :])):
-        _refuse_copies([(one.label, one.oscillation.amplitudes) for one in own], side)
+        motions.append(session.motion)
+    for side, side_motions in (("A", motions[: len(a)]), ("B", motions[len(a) :])):
+        _refuse_copies(
+            [(motion.label, motion.oscillation.amplitudes) for motion in side_motions], side
+        )
     common = common_motion(motions)
     sides = [
-        replace(one, estimates={**one.estimates, **motion_estimates(motion, common)})
-        for one, motion in zip((*a, *b), motions, strict=True)
+        replace(session, estimates={**session.estimates, **motion_estimates(motion, common)})
+        for session, motion in zip((*a, *b), motions, strict=True)
     ]
     aligned = Alignment(common.names, dict(common.left_out), None)
     return sides[: len(a)], sides[len(a) :], aligned, common.before
@@ -412,8 +432,13 @@ def _at_one_command(
 ) -> tuple[list[ComparedSession], list[ComparedSession]]:
     """Return both sides with the offsets of each joint at one command."""
     every = [*a, *b]
-    moved = at_one_command([one.estimates for one in every], [one.commands for one in every])
-    sides = [replace(one, estimates=known) for one, known in zip(every, moved, strict=True)]
+    moved = at_one_command(
+        [session.estimates for session in every], [session.commands for session in every]
+    )
+    sides = [
+        replace(session, estimates=estimates)
+        for session, estimates in zip(every, moved, strict=True)
+    ]
     return sides[: len(a)], sides[len(a) :]
 
 
@@ -438,7 +463,9 @@ def _warn(
             "one run differs from the next; record several runs a side "
             "and give them with --a and --b"
         )
-        inputs = [next(iter(one.analysis.provenance.inputs.values())) for one in (a[0], b[0])]
+        inputs = [
+            next(iter(session.analysis.provenance.inputs.values())) for session in (a[0], b[0])
+        ]
         if inputs[0] == inputs[1]:
             warn("both files have the same content: one session is compared with itself")
     if design == "groups" and max(len(a), len(b)) < 4:
@@ -455,9 +482,9 @@ def _waveforms(
 ) -> tuple[Waveform, ...]:
     waveforms: list[Waveform] = []
     for name in names:
-        if not all(name in one.cycles for one in (*a, *b)):
+        if not all(name in session.cycles for session in (*a, *b)):
             continue
-        sides = [[_by_first(one, name, names) for one in side] for side in (a, b)]
+        sides = [[_by_first(session, name, names) for session in side] for side in (a, b)]
         first, second, difference = differ(sides[0], sides[1], design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
@@ -485,7 +512,7 @@ def _by_first(session: ComparedSession, name: str, names: Sequence[str]) -> Quan
         )
     run = session.run
     group = run.group[run.names.index(name)]
-    members = [k for k, own in enumerate(run.group) if own == group]
+    members = [k for k, other in enumerate(run.group) if other == group]
     commands = run.command[[members[0], next(k for k in members if run.names[k] in names)]]
     return turned(session.cycles[name], float(np.angle(commands[0] / commands[1])))
 
@@ -493,7 +520,7 @@ def _by_first(session: ComparedSession, name: str, names: Sequence[str]) -> Quan
 def _provenance(
     a: Sequence[ComparedSession], b: Sequence[ComparedSession], choices: Choices
 ) -> Provenance:
-    paths = [[one.analysis.session.path for one in side] for side in (a, b)]
+    paths = [[session.analysis.session.path for session in side] for side in (a, b)]
     single = len(a) == len(b) == 1 and not choices.paired
     files = [*paths[0], *paths[1]] if single else ["--a", *paths[0], "--b", *paths[1]]
     words = [word for word in ("paired", "any_gait") if getattr(choices, word)]
@@ -506,7 +533,9 @@ def _provenance(
     return Provenance(
         command=shlex.join(["undulog", "compare", *files, *options, *choices.session.arguments()]),
         versions=base_versions(),
-        inputs={k: v for one in (*a, *b) for k, v in one.analysis.provenance.inputs.items()},
+        inputs={
+            k: v for session in (*a, *b) for k, v in session.analysis.provenance.inputs.items()
+        },
         options={
             **asdict(choices.session),
             "paired": choices.paired,

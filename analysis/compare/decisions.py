@@ -101,12 +101,12 @@ def family(
     Returns:
         Quantities and where, in the order of ``UNITS``; those of joints near rest, too.
     """
-    every = [one.estimates for one in (*a, *b)]
+    every = [session.estimates for session in (*a, *b)]
     others = [
         place for quantity, place in every[0] if quantity == "rest_amplitude" or of_body(place)
     ]
     keys = itertools.product(UNITS, dict.fromkeys((*joints, *others)))
-    return [key for key in keys if all(key in known for known in every)]
+    return [key for key in keys if all(key in estimates for estimates in every)]
 
 
 def differ(
@@ -127,7 +127,7 @@ def differ(
     """
     if design == "sessions":
         return a[0], b[0], independent(a[0], b[0])
-    runs = [np.stack([one.value for one in side]) for side in (a, b)]
+    runs = [np.stack([quantities.value for quantities in side]) for side in (a, b)]
     first, second = (from_runs(run) for run in runs)
     return first, second, paired(*runs) if design == "pairs" else independent(first, second)
 
@@ -141,7 +141,9 @@ def estimates_of(
         keys: Quantities to take, k.
         lags_about: Lags are taken within pi of these, shape (k,).
     """
-    stack = np.array([[one.estimates[key] for key in keys] for one in side]).transpose(2, 0, 1)
+    stack = np.array([[session.estimates[key] for key in keys] for session in side]).transpose(
+        2, 0, 1
+    )
     lag = np.array([quantity in _CYCLIC for quantity, _ in keys])
     about = lags_about[lag]
     stack[0][:, lag] = about + np.angle(np.exp(1j * (stack[0][:, lag] - about)))
@@ -211,9 +213,9 @@ def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins, rate_rad_s: flo
     fixed |= {"travelling_index": margins.relative, "rest_amplitude": margins.lag_rad}
     margin = np.empty(a.size)
     for kind in dict.fromkeys(kinds.tolist()):
-        one = kinds == kind
-        about = float(np.mean(np.abs(a[one])))
-        margin[one] = fixed.get(kind, margins.relative * about) or np.finfo(np.float64).tiny
+        mask = kinds == kind
+        about = float(np.mean(np.abs(a[mask])))
+        margin[mask] = fixed.get(kind, margins.relative * about) or np.finfo(np.float64).tiny
     return margin
 
 
@@ -227,11 +229,11 @@ def _named(decisions: Sequence[Difference], before: Mapping[str, str]) -> tuple[
         ):
             parts.setdefault(decision.place, []).append(decision)
     named = [
-        NamedJoint(name, float(np.hypot.reduce([one.size for one in both])), least)
+        NamedJoint(name, float(np.hypot.reduce([decision.size for decision in both])), least)
         for name, both in parts.items()
-        if (least := min(one.p_holm for one in both)) < SIGNIFICANT_DIFFERENCE
+        if (least := min(decision.p_holm for decision in both)) < SIGNIFICANT_DIFFERENCE
     ]
-    return tuple(sorted(named, key=lambda one: -one.size))
+    return tuple(sorted(named, key=lambda joint: -joint.size))
 
 
 def _follow(decisions: Sequence[Difference], before: Mapping[str, str]) -> set[str]:
@@ -244,13 +246,13 @@ def _follow(decisions: Sequence[Difference], before: Mapping[str, str]) -> set[s
         for decision in decisions
         if decision.quantity == "phase_lag" and decision.p_holm < SIGNIFICANT_DIFFERENCE
     }
-    found: set[str] = set()
+    following: set[str] = set()
     for joint, last in before.items():  # in chain order
-        if joint in lags and last in lags and last not in found:
-            own, other = lags[joint], lags[last]
-            if own * other < 0 and abs(own + other) < min(abs(own), abs(other)) / 2:
-                found.add(joint)
-    return found
+        if joint in lags and last in lags and last not in following:
+            lag, other = lags[joint], lags[last]
+            if lag * other < 0 and abs(lag + other) < min(abs(lag), abs(other)) / 2:
+                following.add(joint)
+    return following
 
 
 def _equivalence(
@@ -258,9 +260,9 @@ def _equivalence(
 ) -> tuple[Equivalence, ...]:
     results: list[Equivalence] = []
     for kind in dict.fromkeys(kinds.tolist()):
-        one = kinds == kind
-        value, within = differences.value[one], float(margin[one][0])
-        p = equivalence_p(value, differences.error[one], differences.dof[one], within)
+        mask = kinds == kind
+        value, within = differences.value[mask], float(margin[mask][0])
+        p = equivalence_p(value, differences.error[mask], differences.dof[mask], within)
         unit = "1" if kind in _BY_RATIO else UNITS[kind]
         results.append(Equivalence(kind, within, unit, float(np.abs(value).max()), p))
     return tuple(results)
@@ -281,25 +283,25 @@ def answer_of(
     """
     if broken:
         rest = answer_of(_without(decided, broken), partial, verb=verb)[1]
-        listed = "; ".join(each.text for each in broken[:MOST])
+        listed = "; ".join(joint.text for joint in broken[:MOST])
         more = len(broken) - MOST
         listed += f"; and {more} more joints" if more > 0 else ""
         return "different", f"{listed}; of the others: {rest}"
     beyond_doubt = _beyond_doubt(decided)
-    tests = {one.quantity: one for one in decided.equivalence}
+    tests = {test.quantity: test for test in decided.equivalence}
     # Of a gait's joints means are compared, and not shown to be the same.
     required = (*_SAME, "offset") if "delay" in tests else _SAME
     main = [tests[quantity] for quantity in required if quantity in tests]
-    at_rest = [one for one in beyond_doubt if one.quantity == "rest_amplitude"]
-    same = not at_rest and all(one.p < SIGNIFICANT_DIFFERENCE for one in main)
-    of_joints = [one for one in main if one.quantity != "frequency"]
-    margins = _listed(margin_text(one) for one in of_joints)
+    at_rest = [difference for difference in beyond_doubt if difference.quantity == "rest_amplitude"]
+    same = not at_rest and all(test.p < SIGNIFICANT_DIFFERENCE for test in main)
+    of_joints = [test for test in main if test.quantity != "frequency"]
+    margins = _listed(margin_text(test) for test in of_joints)
     whole = " (partial comparison)" if partial else ""
     joints = len(
         {difference.place for difference in decided.differences if not of_body(difference.place)}
     )
     which = "the joint" if joints == 1 else f"all {joints} joints"
-    words = _listed(dict.fromkeys(WORDS[one.quantity] for one in of_joints))
+    words = _listed(dict.fromkeys(WORDS[test.quantity] for test in of_joints))
     are = "are" if len(of_joints) > 1 else "is"
     alike = f"{words} of {which} {are} equivalent within {margins}"
     if "frequency" in tests:
@@ -328,7 +330,11 @@ def _beyond_doubt(decided: Decided) -> list[Difference]:
 
 def moved_offsets(decided: Decided) -> list[Difference]:
     """Return the offsets that differ beyond doubt, by a margin or more, the largest first."""
-    return [one for one in _beyond_doubt(decided) if one.quantity == "offset" and one.size >= 1]
+    return [
+        difference
+        for difference in _beyond_doubt(decided)
+        if difference.quantity == "offset" and difference.size >= 1
+    ]
 
 
 def offsets_moved(decided: Decided, verb: str) -> str:
@@ -339,8 +345,9 @@ def offsets_moved(decided: Decided, verb: str) -> str:
     """
     moved = moved_offsets(decided)
     parts = [
-        f"the offset of {plain(one.place)} {verb} by {signed_difference(one)} between A and B"
-        for one in moved[:MOST]
+        f"the offset of {plain(difference.place)} {verb} by {signed_difference(difference)} "
+        "between A and B"
+        for difference in moved[:MOST]
     ]
     if (more := len(moved) - MOST) > 0:
         parts.append(f"and those of {more} more joints")
@@ -350,8 +357,12 @@ def offsets_moved(decided: Decided, verb: str) -> str:
 def _large(decided: Decided) -> list[str]:
     """Return the joints whose response differs by a margin or more, the largest first."""
     beyond_doubt = _beyond_doubt(decided)
-    large = {one.place for one in beyond_doubt if one.quantity in RESPONSE and one.size >= 1}
-    return [one.name for one in decided.named if one.name in large]
+    large = {
+        difference.place
+        for difference in beyond_doubt
+        if difference.quantity in RESPONSE and difference.size >= 1
+    }
+    return [joint.name for joint in decided.named if joint.name in large]
 
 
 def _listed(words: Iterable[str]) -> str:
@@ -362,13 +373,13 @@ def _listed(words: Iterable[str]) -> str:
 
 def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
     """Return the decisions without the broken joints."""
-    names = {each.name for each in broken}
+    names = {joint.name for joint in broken}
     return dataclasses.replace(
         decided,
         differences=tuple(
             difference for difference in decided.differences if difference.place not in names
         ),
-        named=tuple(one for one in decided.named if one.name not in names),
+        named=tuple(joint for joint in decided.named if joint.name not in names),
     )
 
 
@@ -448,9 +459,16 @@ def _largest(decided: Decided) -> str:
         where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
         where = f"the body's{first.place[len(BODY) + 1 :]}" if of_body(first.place) else where
         return f"{where} {difference_text(first)} ({formats.p_value_text(first.p_holm)}){more}"
-    own = [one for one in beyond_doubt if one.place == named[0] and one.quantity in RESPONSE]
-    parts = ", ".join(difference_text(one) for one in sorted(own, key=lambda one: one.quantity))
-    smallest = min(one.p_holm for one in own)
+    differences = [
+        difference
+        for difference in beyond_doubt
+        if difference.place == named[0] and difference.quantity in RESPONSE
+    ]
+    parts = ", ".join(
+        difference_text(difference)
+        for difference in sorted(differences, key=lambda difference: difference.quantity)
+    )
+    smallest = min(difference.p_holm for difference in differences)
     others = [plain(name) for name in named[1:]]
     listed = ", ".join(others[:MOST])
     listed += f" and {len(others) - MOST} more" if len(others) > MOST else ""

@@ -174,8 +174,8 @@ class PeriodicMotion:
     @property
     def phased(self) -> frozenset[str]:
         """Names of the joints with a phase."""
-        known = self.oscillation.known_phases()
-        return frozenset(name for name, one in zip(self.names, known, strict=True) if one)
+        has_phase = self.oscillation.known_phases()
+        return frozenset(name for name, phased in zip(self.names, has_phase, strict=True) if phased)
 
     def phase_rad(self, joint: str) -> float:
         """Return the phase of a joint's fundamental at t = 0."""
@@ -229,7 +229,7 @@ def common_motion(motions: Sequence[PeriodicMotion]) -> CommonMotion:
     recorded = [frozenset(motion.chain) for motion in motions]
     phased = [motion.phased for motion in motions]
     joints = list(dict.fromkeys(name for motion in motions for name in motion.chain))
-    names = tuple(name for name in joints if all(name in known for known in phased))
+    names = tuple(name for name in joints if all(name in moving for moving in phased))
     if not names:
         raise DataError(
             "no joint moves at the common frequency in all sessions, so nothing can be compared: "
@@ -239,13 +239,13 @@ def common_motion(motions: Sequence[PeriodicMotion]) -> CommonMotion:
     for name in joints:
         unknown = [
             motion.label
-            for motion, known in zip(motions, recorded, strict=True)
-            if name not in known
+            for motion, chain in zip(motions, recorded, strict=True)
+            if name not in chain
         ]
         at_rest = [
             motion.label
-            for motion, known, moves in zip(motions, recorded, phased, strict=True)
-            if name in known and name not in moves
+            for motion, chain, moves in zip(motions, recorded, phased, strict=True)
+            if name in chain and name not in moves
         ]
         if len(at_rest) == len(motions):
             continue  # at rest on both sides
@@ -266,7 +266,7 @@ def common_motion(motions: Sequence[PeriodicMotion]) -> CommonMotion:
             phases[plane] = phase_line(_select(motions[0], chain), index, index).phases_rad
     return CommonMotion(
         names=names,
-        near_rest=tuple(n for n in left_out if all(n in known for known in recorded)),
+        near_rest=tuple(n for n in left_out if all(n in chain for chain in recorded)),
         left_out=left_out,
         planes=planes,
         phases_rad=phases,
@@ -281,30 +281,30 @@ def motion_estimates(motion: PeriodicMotion, common: CommonMotion) -> dict[Key, 
         ln amplitude [1] and phase lag [rad] of the joints, amplitude of joints near rest [rad];
         ln frequency [Hz], wave number [rad/joint] and travelling index of the body.
     """
-    found: dict[Key, Known] = {}
+    estimates: dict[Key, Known] = {}
     oscillation, dof = motion.oscillation, motion.oscillation.dof
     row = {name: k for k, name in enumerate(motion.names)}
     for name in common.names:
         size, error = amplitude(oscillation, row[name])
-        found["amplitude", name] = float(np.log(size)), (error / size) ** 2, dof
+        estimates["amplitude", name] = float(np.log(size)), (error / size) ** 2, dof
     for name in common.near_rest:
         size, error = amplitude(oscillation, row[name]) if name in row else (0.0, 0.0)
-        found["rest_amplitude", name] = size, error**2, dof
+        estimates["rest_amplitude", name] = size, error**2, dof
     for name, last in common.before.items():
         lag, error = phase_lag(oscillation, row[name], row[last])
         if lag.value is not None:
-            found["phase_lag", name] = lag.value, error**2, dof
-    found["frequency", BODY] = motion.log_frequency
+            estimates["phase_lag", name] = lag.value, error**2, dof
+    estimates["frequency", BODY] = motion.log_frequency
     for plane, (chain, index) in common.planes.items():
         place = BODY if len(common.planes) == 1 else f"{BODY}, {plane}"
         chosen = _select(motion, chain)
         line = phase_line(chosen, index, index, common.phases_rad[plane])
         if line.slope.value is not None:
-            found["wave_number", place] = line.slope.value, line.error**2, dof
+            estimates["wave_number", place] = line.slope.value, line.error**2, dof
         travelling, error = travelling_index(chosen)
         if travelling.value is not None:
-            found["travelling_index", place] = travelling.value, error**2, dof
-    return found
+            estimates["travelling_index", place] = travelling.value, error**2, dof
+    return estimates
 
 
 def _select(motion: PeriodicMotion, names: Sequence[str]) -> Oscillation:

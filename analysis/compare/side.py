@@ -130,7 +130,7 @@ def facts_of(session: SessionView) -> dict[str, str]:
         kept = {key: value for key, value in table.items() if key not in _TEXTS}
         facts |= {f"{file}: {key}": text for key, text in _flat(kept).items()}
     recorded = session.metadata.get("undulog", {}).items()
-    return facts | {f"session: {key}": one for key, one in recorded if key not in _OF_THE_RUN}
+    return facts | {f"session: {key}": value for key, value in recorded if key not in _OF_THE_RUN}
 
 
 def one_robot(facts: Sequence[Mapping[str, str]]) -> bool:
@@ -157,12 +157,12 @@ def changes(
         other.
     """
     names = list(dict.fromkeys(name for facts in (*a, *b) for name in facts))
-    found = [
+    changed = [
         MetadataChange(name, *sides)
         for name in names
         if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
     ]
-    return tuple(sorted(found, key=lambda one: _ORDER.index(one.name.partition(":")[0])))
+    return tuple(sorted(changed, key=lambda change: _ORDER.index(change.name.partition(":")[0])))
 
 
 def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
@@ -175,7 +175,7 @@ def _flat(value: Any, before: str = "") -> dict[str, str]:
     parts: dict[str, Any] = {}
     if isinstance(value, dict):
         table = cast("dict[str, Any]", value)
-        parts = {f"{before}.{key}" if before else key: one for key, one in table.items()}
+        parts = {f"{before}.{key}" if before else key: part for key, part in table.items()}
     elif isinstance(value, list):
         for k, part in enumerate(cast("list[Any]", value)):
             if isinstance(part, dict):
@@ -249,11 +249,11 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
         moved = {"speed": speed(steps)}
         if total is not None:
             moved["cost_of_transport"] = cost_of_transport(steps, total)
-        for quantity, known in moved.items():
-            if known is None:
+        for quantity, estimate in moved.items():
+            if estimate is None:
                 warn(f"no {quantity.replace('_', ' ')}: it hardly gets anywhere")
             else:
-                estimates[quantity, BODY] = known
+                estimates[quantity, BODY] = estimate
     offsets = {
         name: float(np.median(offset)) for name, offset in measured.offsets.items() if offset.size
     }
@@ -287,9 +287,9 @@ def turned(cycle: Quantities, by_rad: float) -> Quantities:
 
 def _responses(measured: SessionMeasurement, run: GaitRun) -> dict[Key, Known]:
     gait = measured.gait
-    found: dict[Key, Known] = {}
+    estimates: dict[Key, Known] = {}
     if gait is None:
-        return found
+        return estimates
     sound = {n for n, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
     for group in gait.groups:
         response = group.response
@@ -299,18 +299,18 @@ def _responses(measured: SessionMeasurement, run: GaitRun) -> dict[Key, Known]:
             if name in sound:
                 dof = float(response.dof[k])
                 gain, lag = float(np.log(response.gain[k])), float(response.lag_rad[k])
-                found["gain", name] = gain, float(response.log_gain_variance[k]), dof
-                found["lag", name] = lag, float(response.lag_variance[k]), dof
-    return found
+                estimates["gain", name] = gain, float(response.log_gain_variance[k]), dof
+                estimates["lag", name] = lag, float(response.lag_variance[k]), dof
+    return estimates
 
 
 def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
-    found: dict[Key, Known] = {}
+    estimates: dict[Key, Known] = {}
     for name, energies in measured.energies.items():
         power = energies.mechanical
-        if power is not None and (known := mean_of_cycles(power.abs_j)) is not None:
-            found["energy_abs", name] = known
-    return found
+        if power is not None and (mean := mean_of_cycles(power.abs_j)) is not None:
+            estimates["energy_abs", name] = mean
+    return estimates
 
 
 def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]:

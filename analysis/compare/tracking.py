@@ -73,17 +73,19 @@ def at_one_command(
     common: dict[str, float] = {}
     apart: set[str] = set()
     for name in dict.fromkeys(name for command in commands for name in command):
-        own = [command[name] for command in commands if name in command]
-        means = np.array([command.mean_rad for command in own])
+        joint_commands = [command[name] for command in commands if name in command]
+        means = np.array([command.mean_rad for command in joint_commands])
         common[name] = float(means.mean())
-        if np.ptp(means) >= ANGLE_MARGIN_RAD and any(command.slope is None for command in own):
+        if np.ptp(means) >= ANGLE_MARGIN_RAD and any(
+            command.slope is None for command in joint_commands
+        ):
             apart.add(name)
     return [
         {
-            key: _at(one, of_session.get(key[1]), common.get(key[1], 0.0))
+            key: _at(value, of_session.get(key[1]), common.get(key[1], 0.0))
             if key[0] == "offset"
-            else one
-            for key, one in estimate.items()
+            else value
+            for key, value in estimate.items()
             if key[0] != "offset" or key[1] not in apart
         }
         for estimate, of_session in zip(estimates, commands, strict=True)
@@ -111,17 +113,17 @@ def offset_estimates(offsets: Mapping[str, GaitOffset]) -> dict[Key, Known]:
 
 def tracking_estimates(joints: Iterable[JointTracking]) -> dict[Key, Known]:
     """Return ln gain [1], delay [s] and offset [rad] of the joints that respond."""
-    known: dict[Key, Known] = {}
+    estimates: dict[Key, Known] = {}
     for joint in joints:
         gain = joint.gain.value or 0.0
         if gain <= 0 or joint.gain.ci95 is None:
             continue
         relative = error_of(joint.gain, joint.freedom) / gain
-        known["gain", joint.joint] = float(np.log(gain)), relative**2, joint.freedom
+        estimates["gain", joint.joint] = float(np.log(gain)), relative**2, joint.freedom
         for quantity, estimate in (("delay", joint.lag_s), ("offset", joint.offset_rad)):
             error = error_of(estimate, joint.freedom)
-            known[quantity, joint.joint] = estimate.value or 0.0, error**2, joint.freedom
-    return known
+            estimates[quantity, joint.joint] = estimate.value or 0.0, error**2, joint.freedom
+    return estimates
 
 
 def error_of(estimate: Estimate, freedom: float) -> float:
@@ -169,5 +171,5 @@ def commands_differ(
 
 def _command(side: Sequence[Sequence[JointTracking]], name: str) -> np.ndarray:
     """Return mean range [rad] and rate [rad/s] of a joint's command over a side's sessions."""
-    own = [joint for joints in side for joint in joints if joint.joint == name]
-    return np.mean([(joint.commanded_rad, joint.speed_rad_s) for joint in own], axis=0)
+    tracked = [joint for joints in side for joint in joints if joint.joint == name]
+    return np.mean([(joint.commanded_rad, joint.speed_rad_s) for joint in tracked], axis=0)
