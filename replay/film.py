@@ -309,11 +309,11 @@ def _camera(recording: Path, shot: Shot) -> Generator[Callable[[float], Image.Im
                 viewer.seek(seconds)
                 return Image.open(io.BytesIO(viewer.picture_of(view_id))).convert("RGB")
 
-            found = look(shot.start_s).size
-            if found == shot.size:
+            size = look(shot.start_s).size
+            if size == shot.size:
                 yield look
                 return
-            around = (window[0] - found[0], window[1] - found[1])
+            around = (window[0] - size[0], window[1] - size[1])
     raise UndulogError(f"the viewer doesn't draw a picture of {shot.size[0]}x{shot.size[1]} pixels")
 
 
@@ -324,9 +324,9 @@ def _caption(legend: str, seconds: float, speed: float) -> str:
 
 def _font(legend: str, size: tuple[int, int]) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return a font that is easy to read and fits the legend."""
-    wanted = max(11.0, size[1] / 32.0)
-    wide = ImageFont.load_default(wanted).getlength(legend)
-    return ImageFont.load_default(min(wanted, wanted * 0.95 * size[0] / max(wide, 1.0)))
+    height = max(11.0, size[1] / 32.0)
+    wide = ImageFont.load_default(height).getlength(legend)
+    return ImageFont.load_default(min(height, height * 0.95 * size[0] / max(wide, 1.0)))
 
 
 def _labelled(

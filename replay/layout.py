@@ -69,8 +69,8 @@ class Views:
         """Every view, in reading order."""
         session = (self.scene, self.mode, *self.words, *self.angles, *self.effort, *self.bars)
         mean = (self.mean_scene, self.mean_words, *self.mean_plots)
-        found = (*session, *self.maps, *self.steps, *mean)
-        return tuple(view for view in found if view is not None)
+        views = (*session, *self.maps, *self.steps, *mean)
+        return tuple(view for view in views if view is not None)
 
 
 def build_views(content: Content) -> Views:
@@ -93,12 +93,14 @@ def build_views(content: Content) -> Views:
         effort=effort,
         bars=[bar_chart(chart.title, f"{SEGMENTS}/{chart.key}/**") for chart in content.charts],
         maps=[
-            rrb.Spatial2DView(name=one.title, origin=one.entity, visual_bounds=bounds)
-            for one in content.maps
+            rrb.Spatial2DView(name=heat_map.title, origin=heat_map.entity, visual_bounds=bounds)
+            for heat_map in content.maps
         ],
         steps=[
-            _whole_plot(f"{one.name} by cycle [{one.unit}]", [part.entity for part in series])
-            for one, series in content.cycles
+            _whole_plot(
+                f"{quantity.name} by cycle [{quantity.unit}]", [part.entity for part in series]
+            )
+            for quantity, series in content.cycles
         ],
         mean_scene=_mean_scene(content),
         mean_words=None if content.mean is None else about,
@@ -248,13 +250,15 @@ def _lines(
     series: Sequence[PlottedSeries], names: set[str] | None
 ) -> dict[EntityPathLike, rrb.Visualizer]:
     visualizers: dict[EntityPathLike, rrb.Visualizer] = {}
-    for one in series:
-        shown = [names is None or name in names for name in one.names]
+    for plotted in series:
+        shown = [names is None or name in names for name in plotted.names]
         source = VisualizerComponentMapping(
-            entities.SCALARS, ComponentSourceKind.SourceComponent, source_component=one.component
+            entities.SCALARS,
+            ComponentSourceKind.SourceComponent,
+            source_component=plotted.component,
         )
         look = rr.SeriesLines.from_fields(visible_series=shown)
-        visualizers[one.entity] = look.visualizer(mappings=[source])
+        visualizers[plotted.entity] = look.visualizer(mappings=[source])
     return visualizers
 
 

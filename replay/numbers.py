@@ -177,18 +177,18 @@ def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:
             raise DataError(
                 f"{path}: a {kind} names no session; give the result that it is part of"
             )
-        own = _own(result, session, path)
-        found = list(_named(result))
-        if own is not None:
+        numbers = _own(result, session, path)
+        modules = list(_named(result))
+        if numbers is not None:
             if analysis is not None:
                 raise DataError(f"{path}: the second result with numbers of this session; give one")
-            analysis = own
+            analysis = numbers
             notes.append(f"gain, lag and energy are those of {path.name}")
-            found += _named(own) if own is not result else ()
-        for one in found:
-            named.setdefault(one.joint, []).append(f"{one.why} ({path.name})")
-    told = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
-    return Layer(analysis, named=told, notes=tuple(notes))
+            modules += _named(numbers) if numbers is not result else ()
+        for module in modules:
+            named.setdefault(module.joint, []).append(f"{module.why} ({path.name})")
+    merged = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
+    return Layer(analysis, named=merged, notes=tuple(notes))
 
 
 def _own(
@@ -197,10 +197,10 @@ def _own(
     """The session's own numbers in a result, or None where it only compares."""
     numbers: dict[str, Analysis | None]
     if isinstance(result, Comparison):
-        numbers = dict.fromkeys(one.id for one in (*result.a, *result.b))
+        numbers = dict.fromkeys(session.id for session in (*result.a, *result.b))
     else:
         several = result.sessions if isinstance(result, Experiment) else [result]
-        numbers = {one.session.id: one for one in several}
+        numbers = {analysis.session.id: analysis for analysis in several}
     if session.session_id not in numbers:
         ids = list(numbers)
         few = f"session{'s' * (len(ids) > 1)} {', '.join(ids[:3])}{' and others' * (len(ids) > 3)}"

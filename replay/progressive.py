@@ -100,7 +100,8 @@ def predict_layout(content: Content, rhythm: LoggedRhythm | None) -> Content:
         content,
         charts=charts,
         maps=tuple(
-            AwaitedMap(f"{MAPS}/{one.key}", f"{one.name} map [{one.unit}]") for one in mapped
+            AwaitedMap(f"{MAPS}/{quantity.key}", f"{quantity.name} map [{quantity.unit}]")
+            for quantity in mapped
         ),
         cycles=tuple(
             (quantity, (PlottedSeries(f"{CYCLES}/{quantity.key}", measured),))
@@ -157,7 +158,7 @@ class Task:
     """A session to be sent to a viewer.
 
     Attributes:
-        known: Saved results; its numbers are computed if these have none.
+        layer: Saved results; its numbers are computed if these have none.
         analysing: Its analysis, not started.
         front: The tab in front once its views are filled; until then it is the session's.
         bar: Told how far it is, of :func:`steps`.
@@ -165,7 +166,7 @@ class Task:
     """
 
     session: SessionView
-    known: Layer
+    layer: Layer
     analysing: Analysing
     front: Tab
     bar: Progress
@@ -265,14 +266,14 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
     session = task.session
     sink = _Sink(viewer, stop)
     try:
-        found = survey(session, BODY_RATE_HZ, brief=True)
+        surveyed = survey(session, BODY_RATE_HZ, brief=True)
         try:
-            return _send(task, sink, found, recording_id(session.session_id))
+            return _send(task, sink, surveyed, recording_id(session.session_id))
         except _UnforeseenError as late:
             note = f"drawn anew, as a second recording: the session begins without {late}"
-            again = replace(task, known=replace(task.known, notes=(*task.known.notes, note)))
-            found = survey(session, BODY_RATE_HZ)
-            return _send(again, sink, found, recording_id(f"{session.session_id}/anew"))
+            again = replace(task, layer=replace(task.layer, notes=(*task.layer.notes, note)))
+            surveyed = survey(session, BODY_RATE_HZ)
+            return _send(again, sink, surveyed, recording_id(f"{session.session_id}/anew"))
     except BaseException:
         viewer.close()  # else what it has not taken would be waited for
         raise
@@ -281,16 +282,16 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
             rec.disconnect()
 
 
-def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, ...]:
+def _send(task: Task, sink: _Sink, surveyed: Survey, identity: str) -> tuple[str, ...]:
     """Draw a session in one recording."""
     session = task.session
     clock = clock_of(session)
-    parts = stretches(session, found.topics, found.context_ns)
+    parts = stretches(session, surveyed.topics, surveyed.context_ns)
     first = next(parts)
     rec = sink.open(identity)
     send_properties(rec, session.session_id, session.start_ns)
     drawing = RerunDrawing(
-        rec, clock, Sources.of(session, found), task.known.named, span=first.span
+        rec, clock, Sources.of(session, surveyed), task.layer.named, span=first.span
     )
     words_first = _words(session) <= _FEW_WORDS
     if words_first:
@@ -299,7 +300,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
         drawing.content = replace(drawing.content, modes=2, has_events=True)
     early = predict_layout(drawing.content, clock.rhythm)
     sink.connect(rec, build_blueprint(early))
-    drawing.write_facts(session, task.known, early, awaited=task.known.analysis is None)
+    drawing.write_facts(session, task.layer, early, awaited=task.layer.analysis is None)
     drawing.write(first)
     sink.hand_over(rec)
     drawn = first.span
@@ -307,16 +308,16 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     task.begun()
 
     if drawn.known_ns is not None:
-        drawing.widen(_whole(session, found), DrawnSpan(start_ns=drawn.stop_ns))
+        drawing.widen(_whole(session, surveyed), DrawnSpan(start_ns=drawn.stop_ns))
     if not words_first:
         drawing.write_words()
     drawing.write_others()
-    if task.known.analysis is None:  # not before: the first picture is still being drawn
+    if task.layer.analysis is None:  # not before: the first picture is still being drawn
         task.analysing.start()
     numbers = _Numbers(task, drawing)
     done = 1
     for stretch in parts:
-        _require_nothing_new(stretch, found)
+        _require_nothing_new(stretch, surveyed)
         drawing.write(stretch)
         sink.hand_over(rec)
         numbers.draw()
@@ -345,44 +346,46 @@ class _Numbers:
         """Draw them, unless they are drawn; None as long as they aren't known."""
         if self._drawn is not None:
             return self._drawn
-        known = self._task.known
-        if known.analysis is None:
+        layer = self._task.layer
+        if layer.analysis is None:
             computed = self._task.analysing.layer
             if computed is None:
                 return None
-            known = known.with_numbers(computed)
-        self._drawing.write_response(known)
-        self._drawing.write_cycles(known)
-        self._drawing.write_facts(self._task.session, known, self._drawing.content)
-        self._drawn = known
-        return known
+            layer = layer.with_numbers(computed)
+        self._drawing.write_response(layer)
+        self._drawing.write_cycles(layer)
+        self._drawing.write_facts(self._task.session, layer, self._drawing.content)
+        self._drawn = layer
+        return layer
 
 
-def _whole(session: SessionView, found: Survey) -> Survey:
+def _whole(session: SessionView, surveyed: Survey) -> Survey:
     """Complete a brief survey as far as the rest of the drawing needs it."""
-    if found.is_whole:
-        return found
-    _require_nothing_else(session, found)
+    if surveyed.is_whole:
+        return surveyed
+    _require_nothing_else(session, surveyed)
     if "/odom" in session.channels:
-        return found
+        return surveyed
     # The body is drawn at the joints' times.
-    return replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
+    return replace(surveyed, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
 
 
-def _require_nothing_new(stretch: SpanSamples, found: Survey) -> None:
+def _require_nothing_new(stretch: SpanSamples, surveyed: Survey) -> None:
     """Look for joints in a stretch that a brief survey didn't see."""
     for key, tracks in stretch.columns.items():
-        new = [track.name for track in tracks if track.name not in found.seen.get(key, ())]
-        if new and not found.is_whole:
+        new = [track.name for track in tracks if track.name not in surveyed.seen.get(key, ())]
+        if new and not surveyed.is_whole:
             raise _UnforeseenError("{} ({}) of {}".format(*key, ", ".join(new)))
 
 
-def _require_nothing_else(session: SessionView, found: Survey) -> None:
+def _require_nothing_else(session: SessionView, surveyed: Survey) -> None:
     """Look for fields that begin after all that a brief survey saw."""
     for topic, fields in wanted_fields(session).items():
-        for one in fields if topic != GAIT else ():
-            if one not in found.topics.get(topic, ()) and comes(session, topic, one):
-                raise _UnforeseenError(f"{topic} ({one})")
+        for field_name in fields if topic != GAIT else ():
+            if field_name not in surveyed.topics.get(topic, ()) and comes(
+                session, topic, field_name
+            ):
+                raise _UnforeseenError(f"{topic} ({field_name})")
 
 
 def _words(session: SessionView) -> int:

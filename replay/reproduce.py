@@ -69,12 +69,12 @@ def compare_logs(path: Path, other: Path) -> LogDifference:
     """
     with RawLog(path) as first, RawLog(other) as second:
         channels = first.file.channels, second.file.channels
-        own, others = ({one.topic: key for key, one in log.items()} for log in channels)
+        topics, others = ({channel.topic: key for key, channel in log.items()} for log in channels)
         same: list[str] = []
         differs_s: dict[str, float] = {}
         messages = 0
-        for topic in [one for one in own if one in others and one != EVENTS]:
-            pair = _messages_of(first, own[topic]), _messages_of(second, others[topic])
+        for topic in [topic for topic in topics if topic in others and topic != EVENTS]:
+            pair = _messages_of(first, topics[topic]), _messages_of(second, others[topic])
             for a, b in zip_longest(*pair):
                 messages += a is not None
                 if a != b:
@@ -83,7 +83,7 @@ def compare_logs(path: Path, other: Path) -> LogDifference:
                     break
             else:
                 same.append(topic)
-    one_sided = tuple(sorted((own.keys() ^ others.keys()) - {EVENTS}))
+    one_sided = tuple(sorted((topics.keys() ^ others.keys()) - {EVENTS}))
     return LogDifference(tuple(same), differs_s, one_sided, messages)
 
 

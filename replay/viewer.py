@@ -240,7 +240,7 @@ def free_ports(count: int) -> list[int]:
     """Return free ports of this machine."""
     with ExitStack() as stack:
         held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
-        return [int(one.getsockname()[1]) for one in held]
+        return [int(server.getsockname()[1]) for server in held]
 
 
 def _listens(port: int) -> bool:

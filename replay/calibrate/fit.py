@@ -114,7 +114,7 @@ class CalibrationResult:
 def calibrate(
     paths: Sequence[Path],
     world: str | None = None,
-    wanted: Wanted | None = None,
+    options: Wanted | None = None,
     *,
     topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
     kernels: Kernels = Kernels.NUMPY,
@@ -126,7 +126,7 @@ def calibrate(
     Args:
         paths: The sessions: commands and joint states.
         world: Scenario to start from, by name or file; the one each was recorded in if None.
-        wanted: What is to be fitted.
+        options: What is to be fitted.
         topics: Of commands and responses.
         kernels: What computes the force laws.
         on_tick: Called at every tick of every run; may raise to end the fit.
@@ -139,7 +139,7 @@ def calibrate(
         SimulationError: If the twin fails with the starting values.
         LogError: If a session can't be read.
     """
-    wish = wanted or Wanted()
+    wish = options or Wanted()
     sessions = tuple(read_recorded(path, world, wish.settle_s, topics) for path in paths)
     check_alike(sessions)
     answers = Answers(sessions, kernels, on_tick)
@@ -188,9 +188,10 @@ def _calibration(
     lack = _lack(answers, solution, step.freed(solution))
     ends = _ends(solution, lack.alternatives)
     parameters, of_this_step = (
-        _all_fitted(solution, of, within, fits=not lack.found) for of in (step.widened(*ends), ends)
+        _all_fitted(solution, of, within, fits=not lack.significant)
+        for of in (step.widened(*ends), ends)
     )
-    unclear = [i for i, p in enumerate(parameters) if not (p.determined or lack.found)]
+    unclear = [i for i, p in enumerate(parameters) if not (p.determined or lack.significant)]
     by_step = [i for i in unclear if of_this_step[i].determined]
     return CalibrationResult(
         sessions=tuple(str(session.path) for session in answers.sessions),
@@ -236,19 +237,19 @@ def _all_fitted(
 
 
 def _fitted(
-    one: Unknown, x: float, ends: tuple[float, float], within: float, *, fits: bool
+    parameter: Unknown, x: float, ends: tuple[float, float], within: float, *, fits: bool
 ) -> FittedParameter:
     half = max(x - ends[0], ends[1] - x)
     # A dead time is no share of itself: 5 % of a control period stand for 5 %.
-    wide = one.value(half) * 100.0 if one.name == DELAY else float(np.expm1(half))
+    wide = parameter.value(half) * 100.0 if parameter.name == DELAY else float(np.expm1(half))
     return FittedParameter(
-        name=one.name,
-        label=one.label,
-        unit=one.unit,
-        module=one.module,
-        start=one.start,
-        value=one.value(x),
-        ci95=(one.value(ends[0]), one.value(ends[1])) if fits else None,
+        name=parameter.name,
+        label=parameter.label,
+        unit=parameter.unit,
+        module=parameter.module,
+        start=parameter.start,
+        value=parameter.value(x),
+        ci95=(parameter.value(ends[0]), parameter.value(ends[1])) if fits else None,
         determined=fits and wide <= within,
     )
 

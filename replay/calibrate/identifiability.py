@@ -108,7 +108,7 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
     Returns:
         The most open one first.
     """
-    spread = np.array([one.spread for one in unknowns])
+    spread = np.array([parameter.spread for parameter in unknowns])
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
     parameters: list[CorrelatedParameters] = []
     for k in np.argsort(values)[::-1].tolist():
@@ -119,7 +119,10 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
         way = way * np.sign(way[np.argmax(np.abs(way))])
         order: list[int] = np.argsort(-np.abs(way)).tolist()
         moved = [(unknowns[i], float(way[i])) for i in order if abs(way[i]) > _MOVED]
-        factors = {one.label: one.value(size) / (one.start or 1.0) for one, size in moved}
+        factors = {
+            parameter.label: parameter.value(size) / (parameter.start or 1.0)
+            for parameter, size in moved
+        }
         parameters.append(CorrelatedParameters(left, factors))
     return tuple(parameters)
 

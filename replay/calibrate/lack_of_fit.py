@@ -147,7 +147,7 @@ class LackOfFit:
         return min(1.0, len(checks) * min(checks))
 
     @property
-    def found(self) -> bool:
+    def significant(self) -> bool:
         """Whether the twin is shown not to fit."""
         return self.p < LEVEL
 
@@ -358,8 +358,8 @@ def _waves(t: FloatArray, omega: float) -> FloatArray:
 def _power(values: FloatArray, waves: FloatArray, others: FloatArray) -> float:
     """Sum of squares that two waves explain beyond the others."""
     basis = np.linalg.qr(others)[0]
-    own = np.linalg.qr(waves - basis @ (basis.T @ waves))[0]
-    return float(np.sum((own.T @ values) ** 2))
+    remainder = np.linalg.qr(waves - basis @ (basis.T @ waves))[0]
+    return float(np.sum((remainder.T @ values) ** 2))
 
 
 def _rms(parts: Sequence[FloatArray]) -> float:

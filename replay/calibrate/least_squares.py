@@ -158,7 +158,7 @@ class LeastSquares:
         return sum(float(r @ r) / s**2 for r, s in rows)
 
 
-def larger(one: FloatArray, other: FloatArray) -> FloatArray:
+def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:
     """The larger of two covariances, direction by direction, shape (K, K).
 
     Args:
@@ -167,7 +167,7 @@ def larger(one: FloatArray, other: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(other + 1e-12 * np.trace(other) * np.eye(len(other)))
     root = vectors * np.sqrt(values)
     back = vectors / np.sqrt(values)
-    share, turn = np.linalg.eigh(back.T @ one @ back)
+    share, turn = np.linalg.eigh(back.T @ covariance @ back)
     spread = root @ turn
     return (spread * np.maximum(share, 1.0)) @ spread.T
 

@@ -91,18 +91,18 @@ def unknowns(
     (servo,) = servos
     ground = scenario.world.ground
     of_law = _VISCOUS if ground is not None and ground.law is FrictionLaw.VISCOUS else _DRY
-    found = {
+    parameters = {
         name: Unknown(name, unit, float(getattr(owner, name)), spread)
         for owner, units in ((servo, SERVO), (ground, of_law))
         for name, unit in (units.items() if owner is not None else ())
     }
     for name in only:
-        if name not in found:
-            raise UsageError(f"--only {name}: expected one of {', '.join(found)}")
-        if found[name].start == 0.0:
+        if name not in parameters:
+            raise UsageError(f"--only {name}: expected one of {', '.join(parameters)}")
+        if parameters[name].start == 0.0:
             raise UsageError(f"--only {name}: it is 0 in {scenario.name} and can't be scaled")
-    wanted = [one for name, one in found.items() if not only or name in only]
-    chosen = tuple(one for one in wanted if one.start > 0.0)
+    selected = [parameter for name, parameter in parameters.items() if not only or name in only]
+    chosen = tuple(parameter for parameter in selected if parameter.start > 0.0)
     return (*chosen, Unknown(DELAY, "s", 0.0, 1.0)) if delay else chosen
 
 
@@ -122,25 +122,25 @@ def module_unknown(scenario: Scenario, joint: str, spread: float) -> Unknown:
     return Unknown("stall_torque", "1", 1.0, spread, joint)
 
 
-def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) -> Scenario:
+def with_values(scenario: Scenario, parameters: Sequence[Unknown], x: FloatArray) -> Scenario:
     """The scenario with other parameters.
 
     Args:
         scenario: With theta_0.
-        wanted: K unknowns.
+        parameters: K unknowns.
         x: Shape (K,).
 
     Returns:
         The scenario to run; its tables of modules are left as they were.
     """
     shared, of_ground, factor = dict[str, float](), dict[str, float](), dict[str, float]()
-    for one, entry in zip(wanted, x.tolist(), strict=True):
-        if one.module is not None:
-            factor[one.module] = one.value(entry)
-        elif one.name in SERVO:
-            shared[one.name] = one.value(entry)
-        elif one.name != DELAY:
-            of_ground[one.name] = one.value(entry)
+    for parameter, entry in zip(parameters, x.tolist(), strict=True):
+        if parameter.module is not None:
+            factor[parameter.module] = parameter.value(entry)
+        elif parameter.name in SERVO:
+            shared[parameter.name] = parameter.value(entry)
+        elif parameter.name != DELAY:
+            of_ground[parameter.name] = parameter.value(entry)
     joints = tuple(
         dataclasses.replace(joint, servo=_servo(joint.servo, shared, factor.get(joint.name, 1.0)))
         for joint in scenario.robot.joints
@@ -156,7 +156,7 @@ def _servo(servo: Servo, shared: dict[str, float], factor: float) -> Servo:
     return dataclasses.replace(given, stall_torque=given.stall_torque * factor)
 
 
-def late_s(wanted: Sequence[Unknown], x: FloatArray) -> float:
+def late_s(parameters: Sequence[Unknown], x: FloatArray) -> float:
     """Dead time among the unknowns [s]."""
-    pairs = zip(wanted, x.tolist(), strict=True)
-    return sum(one.value(entry) for one, entry in pairs if one.name == DELAY)
+    pairs = zip(parameters, x.tolist(), strict=True)
+    return sum(parameter.value(entry) for parameter, entry in pairs if parameter.name == DELAY)

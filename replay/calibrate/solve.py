@@ -95,16 +95,16 @@ def solve(
     Raises:
         SimulationError: If the twin fails at the start.
     """
-    wanted = tuple(unknowns)
-    x = np.zeros(len(wanted)) if start is None else start.copy()
-    residuals = before = _residuals(answers, wanted, x)
-    precision = _precision(wanted)
+    parameters = tuple(unknowns)
+    x = np.zeros(len(parameters)) if start is None else start.copy()
+    residuals = before = _residuals(answers, parameters, x)
+    precision = _precision(parameters)
     columns: tuple[FloatArray, ...] = ()
     damping, iterations, converged = 0.0, 0, False
     while True:
         sigma = deviations(residuals)
         if not converged:  # the last step is too small to change them
-            columns = derivatives(answers, wanted, x)
+            columns = derivatives(answers, parameters, x)
         problem = LeastSquares(columns, residuals, sigma, precision)
         if converged or iterations >= most:
             break
@@ -117,7 +117,7 @@ def solve(
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
             step *= min(1.0, LONGEST / float(np.abs(step).max()))
             try:
-                there = _residuals(answers, wanted, x + step)
+                there = _residuals(answers, parameters, x + step)
             except SimulationError:  # too far: too stiff or too soft for the physics step
                 damping = max(30.0 * damping, 1e-2)
                 continue
@@ -133,7 +133,7 @@ def solve(
         else:
             most = iterations
     return Solution(
-        unknowns=wanted,
+        unknowns=parameters,
         x=x,
         covariance=problem.covariance(),
         before=before,
@@ -147,39 +147,42 @@ def solve(
 
 
 def derivatives(
-    answers: Answers, wanted: Sequence[Unknown], x: FloatArray, only: Sequence[int] | None = None
+    answers: Answers,
+    parameters: Sequence[Unknown],
+    x: FloatArray,
+    only: Sequence[int] | None = None,
 ) -> tuple[FloatArray, ...]:
     """J: how the twin's angles change with x.
 
     Args:
         answers: The twin under the commands.
-        wanted: K unknowns.
+        parameters: K unknowns.
         x: Shape (K,).
         only: Indices of the k entries to differentiate by; all if None.
 
     Returns:
         [rad], shapes (n_j, k).
     """
-    shifts = STEP * np.eye(len(wanted))[slice(None) if only is None else list(only)]
+    shifts = STEP * np.eye(len(parameters))[slice(None) if only is None else list(only)]
     points = [x + s * shift for shift in shifts for s in (1.0, -1.0)]
-    angles = iter(answers.near(wanted, points))
-    found = [
+    angles = iter(answers.near(parameters, points))
+    slopes = [
         tuple((a - b) / (2 * STEP) for a, b in zip(up, down, strict=True))
         for up, down in zip(angles, angles, strict=True)
     ]
-    return tuple(np.stack(parts, axis=1) for parts in zip(*found, strict=True))
+    return tuple(np.stack(parts, axis=1) for parts in zip(*slopes, strict=True))
 
 
 def _residuals(
-    answers: Answers, wanted: Sequence[Unknown], x: FloatArray
+    answers: Answers, parameters: Sequence[Unknown], x: FloatArray
 ) -> tuple[FloatArray, ...]:
-    there = answers.at(wanted, x)
+    there = answers.at(parameters, x)
     return tuple(a - b for a, b in zip(answers.measured.angles, there, strict=True))
 
 
-def _precision(wanted: Sequence[Unknown]) -> FloatArray:
+def _precision(parameters: Sequence[Unknown]) -> FloatArray:
     """Diagonal of P^-1."""
-    return np.array([one.spread**-2 for one in wanted])
+    return np.array([parameter.spread**-2 for parameter in parameters])
 
 
 def _cost(

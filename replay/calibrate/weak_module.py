@@ -62,17 +62,17 @@ def find_weak_module(
     joints = [joint for joint in answers.scenario.robot.joint_names if joint in moved]
     gains: list[float] = []
     for joint in joints:
-        wanted = (*shared.unknowns, module_unknown(answers.scenario, joint, spread))
-        own = derivatives(answers, wanted, np.append(shared.x, 0.0), [len(shared.x)])
-        columns = [np.hstack(pair) for pair in zip(shared.columns, own, strict=True)]
+        parameters = (*shared.unknowns, module_unknown(answers.scenario, joint, spread))
+        added = derivatives(answers, parameters, np.append(shared.x, 0.0), [len(shared.x)])
+        columns = [np.hstack(pair) for pair in zip(shared.columns, added, strict=True)]
         whole, alone = (
             LeastSquares(of, shared.after, shared.sigma, np.append(shared.precision, spread**-2))
-            for of in (columns, own)
+            for of in (columns, added)
         )
         gains.append(float(alone.slope[0]) ** 2 * float(np.linalg.inv(whole.normal)[-1, -1]))
     best = joints[int(np.argmax(gains))]
-    wanted = (*shared.unknowns, module_unknown(answers.scenario, best, spread))
-    fitted = solve(answers, wanted, start=np.append(shared.x, 0.0), on_iteration=on_iteration)
+    parameters = (*shared.unknowns, module_unknown(answers.scenario, best, spread))
+    fitted = solve(answers, parameters, start=np.append(shared.x, 0.0), on_iteration=on_iteration)
     z = abs(float(fitted.x[-1])) / math.sqrt(float(fitted.covariance[-1, -1]))
     p = min(1.0, len(joints) * math.erfc(z / math.sqrt(2.0)))
     return Search(best, p, len(joints)), fitted

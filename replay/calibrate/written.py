@@ -41,7 +41,11 @@ def _robot_text(calibration: CalibrationResult) -> str:
     defaults = cast("dict[str, Any]", values.setdefault("defaults", {}))
     servo = cast("dict[str, Any]", defaults.setdefault("servo", {}))
     # Of a joint that keeps to what all share; a module's own factor is taken out again.
-    factor = {one.module: one.value for one in calibration.parameters if one.module is not None}
+    factor = {
+        parameter.module: parameter.value
+        for parameter in calibration.parameters
+        if parameter.module is not None
+    }
     first = robot.joints[0]
     shared = replace(
         first.servo, stall_torque=first.servo.stall_torque / factor.get(first.name, 1.0)
@@ -51,17 +55,17 @@ def _robot_text(calibration: CalibrationResult) -> str:
             servo[key] = value
     names = ", ".join(plain(Path(session).name) for session in calibration.sessions)
     head = [f"# {robot.name}, its servo fitted to {names}."]
-    if calibration.lack.found:
+    if calibration.lack.significant:
         head.append("# The twin does not fit that session: what follows has no interval.")
     for parameter in calibration.parameters:
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-        known = "" if parameter.determined else "; not determined by this session"
+        remark = "" if parameter.determined else "; not determined by this session"
         within = (
             ""
             if parameter.ci95 is None
             else f", 95 % {parameter.ci95[0]:.4g} to {parameter.ci95[1]:.4g}"
         )
-        head.append(f"# {parameter.label}: {parameter.value:.4g}{unit}{within}{known}")
+        head.append(f"# {parameter.label}: {parameter.value:.4g}{unit}{within}{remark}")
     text = "\n".join([*head, "", tomlkit.dumps(values)])
     parse_robot(text, "fitted robot", dict(robot.databases))  # it can be read back
     return text
@@ -77,11 +81,11 @@ def _scenario_text(calibration: CalibrationResult, robot_file: Path, scenario_fi
     scenario = calibration.scenario
     modules = {parameter.module for parameter in calibration.parameters}
     fitted = [joint for joint in scenario.robot.joints if joint.name in modules]
-    own = {joint.name: {"stall_torque": joint.servo.stall_torque} for joint in fitted}
+    servo_of = {joint.name: {"stall_torque": joint.servo.stall_torque} for joint in fitted}
     return replace(
         scenario,
         robot_name=os.path.relpath(robot_file, scenario_file.parent),
-        modules=Modules({}, own, scenario.modules.link_of),
+        modules=Modules({}, servo_of, scenario.modules.link_of),
     ).toml()
 
 

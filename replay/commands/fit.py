@@ -72,7 +72,7 @@ def fit(
     """
     if not files:
         raise UsageError("give one or several sessions, .mcap")
-    _check(output, scenario, spread, within, one=module is not None and modules)
+    _check(output, scenario, spread, within, both=module is not None and modules)
     scheme, colon, world = on.partition(":")
     if scheme != "twin" or bool(colon) != bool(world):
         raise UsageError(f"--on {on}: expected twin or twin:SCENARIO")
@@ -85,13 +85,13 @@ def fit(
     from ..calibrate.written import write_calibration
 
     compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
-    wanted = Wanted(tuple(only or ()), module, modules, delay, spread, within, settle)
+    options = Wanted(tuple(only or ()), module, modules, delay, spread, within, settle)
     names = ", ".join(file.name for file in files)
     with interruptible() as stop, progress(f"fit to {names}", 1.0) as bar:
         calibration = calibrate(
             files,
             world or None,
-            wanted,
+            options,
             topics=topics.names,
             kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
             on_tick=lambda: check_stop(output, stop),
@@ -114,7 +114,9 @@ def fit(
     return 0
 
 
-def _check(output: Path, scenario: Path | None, spread: float, within: float, *, one: bool) -> None:
+def _check(
+    output: Path, scenario: Path | None, spread: float, within: float, *, both: bool
+) -> None:
     for path in (output, scenario):
         if path is not None and path.suffix.lower() != ".toml":
             raise UsageError(f"{path}: descriptions are TOML; end its name in .toml")
@@ -124,14 +126,14 @@ def _check(output: Path, scenario: Path | None, spread: float, within: float, *,
         raise UsageError(f"--spread {spread:g}: give a share between 0 and 2")
     if not 0 < within < 1:
         raise UsageError(f"--within {within:g}: give a share between 0 and 1")
-    if one:
+    if both:
         raise UsageError("--module and --modules: give one of them")
 
 
 def _summary(calibration: CalibrationResult) -> Iterator[str]:
     """Yield lines for a terminal: the answer first, joints last."""
-    before, after = (_rms(one) for one in (calibration.before, calibration.after))
-    if calibration.lack.found:
+    before, after = (_rms(misfits) for misfits in (calibration.before, calibration.after))
+    if calibration.lack.significant:
         yield from _lack(calibration.lack)
     yield (
         f"{', '.join(calibration.sessions)} in {calibration.world}: "
@@ -141,7 +143,7 @@ def _summary(calibration: CalibrationResult) -> Iterator[str]:
     )
     if not calibration.converged:
         yield "The fit did not come to an end: take its numbers as a step on the way."
-    fits = not calibration.lack.found
+    fits = not calibration.lack.significant
     yield "Parameters (95 % interval; before):" if fits else "Parameters (no interval; before):"
     width = max(len(parameter.label) for parameter in calibration.parameters)
     yield from (f"  {_parameter(parameter, width)}" for parameter in calibration.parameters)
@@ -177,18 +179,18 @@ def _facts(calibration: CalibrationResult) -> dict[str, Any]:
         "would_tell": list(calibration.would_tell),
         "search": None
         if search is None
-        else {**vars(search), "named": search.named and not lack.found},
+        else {**vars(search), "named": search.named and not lack.significant},
         "misfit": {
             joint: {"before": vars(first), "after": vars(calibration.after[joint])}
             for joint, first in calibration.before.items()
         },
-        "fits": not lack.found,
+        "fits": not lack.significant,
         "lack_of_fit": {
             "p": lack.p,
             "worst": lack.worst,
             "explanation": None if lack.explanation is None else lack.explanation.label,
             "gait_hz": lack.gaits_hz[0] if lack.gaits_hz else None,
-            "joints": {joint: vars(one) for joint, one in lack.joints.items()},
+            "joints": {joint: vars(result) for joint, result in lack.joints.items()},
             "alternatives": [
                 {
                     "label": alternative.label,
@@ -248,7 +250,7 @@ def _size(other: Alternative) -> str:
 
 
 def _checked(lack: LackOfFit) -> Iterator[str]:
-    if lack.found:
+    if lack.significant:
         return
     what = "the gait's harmonics" if lack.gaits_hz else "the residual's memory"
     off = ""
@@ -317,7 +319,7 @@ def _search(calibration: CalibrationResult) -> Iterator[str]:
     if (search := calibration.search) is None:
         return
     p = _p(search.p)
-    if search.named and calibration.lack.found:
+    if search.named and calibration.lack.significant:
         yield (
             f"Of {search.tried} modules {search.module} lessens the misfit most; whether it "
             "differs is open, since the twin doesn't fit."

@@ -186,8 +186,8 @@ def _report_overlay(beside: Overlay, how: Align, place: Place, *, saved: bool, j
         "sessions": [_session(beside, k) for k in range(len(beside.shown))],
         "warnings": list(beside.warnings),
     }
-    first, *others = [one.side for one in beside.shown]
-    lines = [f"{words.answer(first, other, beside.found[other.name])}." for other in others]
+    first, *others = [content.side for content in beside.shown]
+    lines = [f"{words.answer(first, other, beside.outcomes[other.name])}." for other in others]
     if saved:
         lines.append(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
     emit(facts, [*lines, *(f"note: {text}" for text in beside.warnings)], as_json=json)
@@ -196,23 +196,23 @@ def _report_overlay(beside: Overlay, how: Align, place: Place, *, saved: bool, j
 def _session(beside: Overlay, place: int) -> dict[str, Any]:
     from ..overlay import layout as words
 
-    one, first = beside.shown[place], beside.shown[0].side
-    side = one.side
+    content, first = beside.shown[place], beside.shown[0].side
+    side = content.side
     facts: dict[str, Any] = {
         "name": side.name,
         "path": str(side.path),
         "session_id": side.session_id,
         "duration_s": (side.end_ns - side.start_ns) * 1e-9,
-        "body": one.body,
+        "body": content.body,
     }
     if not place:
         return facts
-    found, placed = beside.found[side.name], beside.placements.get(side.name)
+    outcome, placed = beside.outcomes[side.name], beside.placements.get(side.name)
     return facts | {
-        "answer": words.answer(first, side, found),
-        "verdict": None if found.comparison is None else found.comparison.verdict,
-        "changed": [{"name": c.name, "a": c.a, "b": c.b} for c in found.changed],
-        "joints_compared": [name for series in one.differences for name in series.names],
+        "answer": words.answer(first, side, outcome),
+        "verdict": None if outcome.comparison is None else outcome.comparison.verdict,
+        "changed": [{"name": c.name, "a": c.a, "b": c.b} for c in outcome.changed],
+        "joints_compared": [name for series in content.differences for name in series.names],
         "placed": None
         if placed is None
         else {"turn_rad": placed.turn, "x_m": placed.x, "y_m": placed.y},

@@ -6,5 +6,5 @@
     from undulog.replay.overlay.write import combine_sessions
 
     both = combine_sessions([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
-    print(both.found["twin"].comparison, both.placements["twin"])
+    print(both.outcomes["twin"].comparison, both.placements["twin"])
 """

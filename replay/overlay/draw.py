@@ -137,9 +137,9 @@ def log_name(rec: rr.RecordingStream, side: Side, place: int, head: HeadPath, ro
     lift = _LIFT_RADII * robot.links[0].radius + (_LIFT + _TIER * place) * span
     chosen = decimate(head.t_ns, _NAME_RATE_HZ)
     point = (head.position[chosen] + [0.0, 0.0, lift]).astype(np.float32)
-    known = np.isfinite(point).sum(axis=1) == point.shape[1]  # no name where there is no body
+    finite = np.isfinite(point).sum(axis=1) == point.shape[1]  # no name where there is no body
     for rows, times in side.clock.rows(head.t_ns[chosen]):
-        there = known[rows].astype(np.int64)
+        there = finite[rows].astype(np.int64)
         text = rr.Points3D.columns(
             positions=point[rows][there > 0], labels=[side.name] * int(there.sum())
         )
@@ -150,9 +150,9 @@ def log_ends(rec: rr.RecordingStream, sessions: Sequence[Side]) -> None:
     """Remove each body when its session ends before the others."""
     for timeline in (SESSION_TIME, GAIT_CYCLE):
         ends = {session.entity: _end(session, timeline) for session in sessions}
-        known = {entity: end for entity, end in ends.items() if end is not None}
-        for entity, end in known.items():
-            if end < max(known.values()):
+        last_ns = {entity: end for entity, end in ends.items() if end is not None}
+        for entity, end in last_ns.items():
+            if end < max(last_ns.values()):
                 after = np.array([end + 1], dtype="timedelta64[ns]")
                 cleared = rr.Clear.columns(is_recursive=[True])
                 times = [rr.TimeColumn(timeline, duration=after)]
@@ -189,8 +189,8 @@ def places_in(
     Returns:
         The first session's where the other has them too, else its own.
     """
-    known = {track.name for track in other.measured}
-    return first if first is not None and set(first.names) <= known else places
+    names = {track.name for track in other.measured}
+    return first if first is not None and set(first.names) <= names else places
 
 
 def log_lines(rec: rr.RecordingStream, side: Side, rank: int, places: BodyPlaces | None) -> bool:
@@ -225,8 +225,8 @@ def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None
         powers: Sessions whose power was written, by their place, 0 for the first.
     """
     for place, side in powers.items():
-        own: dict[str, Any] = {"colors": tint(place), "widths": 1.0} if place else {}
-        look = rr.SeriesLines.from_fields(names=side.name, **own)
+        style: dict[str, Any] = {"colors": tint(place), "widths": 1.0} if place else {}
+        look = rr.SeriesLines.from_fields(names=side.name, **style)
         rec.log(f"{side.entity}{POWER}", look, static=True)
 
 
@@ -266,20 +266,20 @@ def log_bars(
     Returns:
         Quantities that at least one joint has.
     """
-    found: set[str] = set()
+    keys: set[str] = set()
     narrow = _NARROW / max(len(sides) - 1, 1)
     for k, (side, seen) in enumerate(sides):
         left, width = (_WIDE + (k - 1) * narrow, narrow) if k else (0.0, _WIDE)
         for quantity in QUANTITIES:
-            for (key, joint), known in seen.estimates.items():
+            for (key, joint), statistic in seen.estimates.items():
                 if key != quantity.key or joint == BODY:
                     continue
-                estimate = _estimate(known, log=key == "gain")
+                estimate = _estimate(statistic, log=key == "gain")
                 bar = _bar(side, joint, estimate, quantity.scale, quantity.baseline)
                 entity = f"{BARS}/{key}{side.entity}"
                 _log(rec, entity, side, bar, left=left - _ALL / 2, width=width)
-                found.add(key)
-    return tuple(quantity for quantity in QUANTITIES if quantity.key in found)
+                keys.add(key)
+    return tuple(quantity for quantity in QUANTITIES if quantity.key in keys)
 
 
 def log_difference_bars(
@@ -294,15 +294,15 @@ def log_difference_bars(
     Returns:
         Quantities of which there is a difference.
     """
-    found: set[str] = set()
+    keys: set[str] = set()
     for quantity in QUANTITIES:
-        for one in () if comparison is None else comparison.differences:
-            if one.quantity == quantity.key and one.place != BODY:
-                bar = _bar(first, one.place, one.difference, quantity.scale, 0.0)
-                entity = f"{other.own}{DIFFERENCES}/{quantity.key}"
+        for difference in () if comparison is None else comparison.differences:
+            if difference.quantity == quantity.key and difference.place != BODY:
+                bar = _bar(first, difference.place, difference.difference, quantity.scale, 0.0)
+                entity = f"{other.compared}{DIFFERENCES}/{quantity.key}"
                 _log(rec, entity, first, bar, left=-_ALL / 2, width=_ALL)
-                found.add(quantity.key)
-    return tuple(quantity for quantity in QUANTITIES if quantity.key in found)
+                keys.add(quantity.key)
+    return tuple(quantity for quantity in QUANTITIES if quantity.key in keys)
 
 
 def _log(
@@ -330,8 +330,8 @@ def _bar(side: Side, joint: str, estimate: Estimate, scale: float, baseline: flo
     return bar_of(joint, side.joints.index(joint) + 1, estimate, scale, baseline)
 
 
-def _estimate(known: Known, *, log: bool) -> Estimate:
-    value, variance, dof = known
+def _estimate(statistic: Known, *, log: bool) -> Estimate:
+    value, variance, dof = statistic
     ends = around(value, t_factor(dof) * math.sqrt(variance))
     if log:
         return Estimate(math.exp(value), (math.exp(ends[0]), math.exp(ends[1])))
@@ -349,15 +349,15 @@ def angle_differences(a: Side, b: Side, how: Align) -> tuple[Track, ...]:
         its samples, NaN where it has none.
     """
     return tuple(
-        Track(one.name, one.t_ns, _taken(a, b, how, one, other) - one.values)
-        for one, other in pairs(a.measured, b.measured)
+        Track(track.name, track.t_ns, _taken(a, b, how, track, other) - track.values)
+        for track, other in pairs(a.measured, b.measured)
     )
 
 
 def _taken(a: Side, b: Side, how: Align, track: Track, other: Track) -> np.ndarray:
-    at_ns, known = counterparts(a, b, how, track.t_ns)
+    at_ns, valid = counterparts(a, b, how, track.t_ns)
     values = np.full(track.t_ns.size, np.nan)
-    values[known] = interpolate(other.t_ns, other.values, at_ns[known])
+    values[valid] = interpolate(other.t_ns, other.values, at_ns[valid])
     return values
 
 
@@ -375,8 +375,8 @@ def log_differences(
         differences: The differences [rad].
         drawn: Its measured angles; joints of one series are drawn at common times.
     """
-    known = {track.name for track in differences}
-    parts = [tuple(name for name in one.names if name in known) for one in drawn]
+    names = {track.name for track in differences}
+    parts = [tuple(name for name in series.names if name in names) for series in drawn]
     plot = Plot(entity, [part for part in parts if part], degrees=True, component=DEGREES)
     plot.style(rec, a.palette)
     plot.write(rec, a.clock, differences)

@@ -62,7 +62,7 @@ class Found:
         return (*left_out, *self.comparison.warnings)
 
 
-def answer(first: Side, other: Side, found: Found) -> str:
+def answer(first: Side, other: Side, outcome: Found) -> str:
     """Return a comparison's answer with the sessions' names.
 
     Args:
@@ -71,13 +71,13 @@ def answer(first: Side, other: Side, found: Found) -> str:
     Returns:
         One sentence without its full stop.
     """
-    result = found.why_not if found.comparison is None else found.comparison.answer
+    result = outcome.why_not if outcome.comparison is None else outcome.comparison.answer
     return f"{other.name} (B) against {first.name} (A): {result}"
 
 
 def markdown(
     sides: Sequence[Side],
-    found: Mapping[str, Found],
+    outcomes: Mapping[str, Found],
     how: Align,
     *,
     has_cycles: bool,
@@ -87,15 +87,15 @@ def markdown(
     """Return the text that is shown beside the picture, as Markdown.
 
     Args:
-        found: Result of the comparison with the first session, by the others' names.
+        outcomes: Result of the comparison with the first session, by the others' names.
         has_cycles: Whether there is a timeline of gait cycles.
         legend: How the bodies differ in style.
         notes: How the bodies were placed, what is missing, what was assumed, a sentence each.
     """
     first, *others = sides
-    parts = [f"**{escaped(answer(first, other, found[other.name]))}.**" for other in others]
+    parts = [f"**{escaped(answer(first, other, outcomes[other.name]))}.**" for other in others]
     parts.append(_table(sides))
-    parts += [_changes(first, other, found[other.name].changed) for other in others]
+    parts += [_changes(first, other, outcomes[other.name].changed) for other in others]
     if notes:
         parts.append(f"Placed and assumed:\n\n{listed(notes)}")
     cycles = "On `gait_cycle` one second is one cycle of the gait, for all sessions alike."
@@ -120,9 +120,9 @@ def _changes(first: Side, other: Side, changed: Sequence[MetadataChange]) -> str
     if not changed:
         return escaped(f"{other.name} is described as {first.name}: nothing was changed.")
     lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
-    for one in changed[:_CHANGES]:
-        before, after = ("not set" if side is None else side for side in (one.a, one.b))
-        lines.append("- " + escaped(f"{one.name}: {before} → {after}"))
+    for change in changed[:_CHANGES]:
+        before, after = ("not set" if side is None else side for side in (change.a, change.b))
+        lines.append("- " + escaped(f"{change.name}: {before} → {after}"))
     if len(changed) > _CHANGES:
         lines.append(f"- and {len(changed) - _CHANGES} more, which `undulog compare` lists")
     return "\n".join(lines)
@@ -168,7 +168,9 @@ def build_blueprint(
         The blueprint; it opens playing.
     """
     differing = [
-        rrb.Horizontal(*_bar_differences(one), name=one.side.name) for one in shown[1:] if one.bars
+        rrb.Horizontal(*_bar_differences(session), name=session.side.name)
+        for session in shown[1:]
+        if session.bars
     ]
     charts = [bar_chart(bar.title, f"{BARS}/{bar.key}/**") for bar in bars]
     groups = (
@@ -181,7 +183,7 @@ def build_blueprint(
     heights = [height for group, height in groups if group]
     words = tabs(_words(shown))
     root: rrb.Container
-    if bodies := [one for one in shown if one.body]:
+    if bodies := [session for session in shown if session.body]:
         left = rrb.Vertical(_scene(bodies, title), words, row_shares=[3.0, 1.5])
         right = rrb.Vertical(*rows, row_shares=heights)
         root = rrb.Horizontal(left, right, column_shares=[1.0, 1.0]) if rows else left
@@ -218,9 +220,11 @@ def _scene(bodies: Sequence[SessionContent], title: str) -> rrb.Spatial3DView:
 
 def _both(shown: Sequence[SessionContent]) -> list[rrb.View]:
     views: list[rrb.View] = []
-    if any(one.lines for one in shown):
+    if any(session.lines for session in shown):
         views.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
-    if powers := [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]:
+    if powers := [
+        f"{session.side.entity}{POWER}" for session in shown if session.content.has_power
+    ]:
         views.append(plot("Mechanical power [W]", powers))
     return views
 
@@ -234,24 +238,29 @@ def _differences(shown: Sequence[SessionContent]) -> list[rrb.View]:
             plane = str(view.name).lower().replace("measured", "").strip()
             view.name = f"{other.side.name} − {first.side.name}, {plane}".replace(", [", " [")
             views.append(view)
-    if apart := [f"{one.side.own}{SEPARATE}" for one in others if one.apart]:
+    if apart := [f"{session.side.compared}{SEPARATE}" for session in others if session.apart]:
         views.append(plot("Heads apart [m]", apart))
     return views
 
 
-def _bar_differences(one: SessionContent) -> list[rrb.View]:
+def _bar_differences(session: SessionContent) -> list[rrb.View]:
     return [
-        bar_chart(f"{one.side.name}: {q.difference}", f"{one.side.own}{DIFFERENCES}/{q.key}/**")
-        for q in one.bars
+        bar_chart(
+            f"{session.side.name}: {q.difference}",
+            f"{session.side.compared}{DIFFERENCES}/{q.key}/**",
+        )
+        for q in session.bars
     ]
 
 
 def _words(shown: Sequence[SessionContent]) -> list[rrb.View]:
     views: list[rrb.View] = [rrb.TextDocumentView(name="Side by side", contents=[FACTS])]
     views += [
-        rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
-        for one in shown
+        rrb.TextDocumentView(name=session.side.name, contents=[f"{session.side.entity}{SESSION}"])
+        for session in shown
     ]
-    if events := [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]:
+    if events := [
+        f"{session.side.entity}{lines.EVENTS}" for session in shown if session.content.has_events
+    ]:
         views.append(rrb.TextLogView(name="Events", contents=events))
     return views

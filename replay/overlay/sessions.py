@@ -102,7 +102,7 @@ class Side:
         return f"/{rr.escape_entity_path_part(self.name)}"
 
     @property
-    def own(self) -> str:
+    def compared(self) -> str:
         """Path under which its comparison with the first session is."""
         return f"{COMPARED}/{rr.escape_entity_path_part(self.name)}"
 
@@ -119,11 +119,11 @@ class Side:
         return tuple(track.name for track in self.measured)
 
 
-def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, ...]:
+def names_of(files: Sequence[Path], requested: Sequence[str] | None) -> tuple[str, ...]:
     """Return the sessions' names.
 
     Args:
-        wanted: Requested names, or None for the files' own.
+        requested: Requested names, or None for the files' own.
 
     Returns:
         A name a session, all different.
@@ -131,12 +131,12 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
     Raises:
         UsageError: If their number is wrong, or they aren't different.
     """
-    if wanted is None:
+    if requested is None:
         stems = [file.stem for file in files]
         if len(set(stems)) == len(stems) and COMPARED.strip("/") not in stems:
             return tuple(stems)
         return tuple(f"{stem} {i + 1}" for i, stem in enumerate(stems))
-    names = [name.strip() for name in wanted]
+    names = [name.strip() for name in requested]
     if len(names) != len(files):
         raise UsageError(
             f"--names gives {len(names)} names for {len(files)} sessions; give one each, with "
@@ -151,8 +151,8 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
 
 def read_side(session: SessionView, name: str) -> Side:
     """Read a session for an overlay."""
-    wanted = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
-    columns = read_columns(session, wanted)
+    topics = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
+    columns = read_columns(session, topics)
     measured = columns.get(("/joint_states", "position"), ())
     head = None
     if session.robot is not None and measured:
@@ -248,10 +248,10 @@ def counterparts(a: Side, b: Side, how: Align, t_ns: IntArray) -> tuple[IntArray
     """
     if how is not Align.PHASE:
         return t_ns - a.zero_ns + b.zero_ns, np.ones(t_ns.shape, dtype=np.bool_)
-    one, other = a.clock.rhythm, b.clock.rhythm
-    assert one is not None  # noqa: S101 - align() saw to it
+    rhythm, other = a.clock.rhythm, b.clock.rhythm
+    assert rhythm is not None  # noqa: S101 - align() saw to it
     assert other is not None  # noqa: S101
-    return times_of(other, interpolate(one.t_ns, one.cycles, t_ns))
+    return times_of(other, interpolate(rhythm.t_ns, rhythm.cycles, t_ns))
 
 
 def times_of(rhythm: LoggedRhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
@@ -275,8 +275,8 @@ def times_of(rhythm: LoggedRhythm, cycles: FloatArray) -> tuple[IntArray, BoolAr
     with np.errstate(invalid="ignore"):
         share = np.where(within, (cycles - at[left]) / (at[left + 1] - at[left]), 0.0)
     step = np.round(share * (t_ns[left + 1] - t_ns[left])).astype(np.int64)
-    known = within & (~gaps(t_ns)[left] | (share == 0.0))
-    return np.where(known, t_ns[left] + step, 0), known
+    valid = within & (~gaps(t_ns)[left] | (share == 0.0))
+    return np.where(valid, t_ns[left] + step, 0), valid
 
 
 def _aligned(side: Side, how: Align) -> Side:
@@ -330,22 +330,22 @@ def placement(a: Side, b: Side, how: Align) -> Placement | None:
     Returns:
         The placement, or None where either has no body at any shared moment.
     """
-    one, other = a.head, b.head
-    if one is None or other is None:
+    head, other = a.head, b.head
+    if head is None or other is None:
         return None
-    at_ns, known = counterparts(a, b, how, one.t_ns)
-    known &= np.isfinite(one.position).all(axis=1)
-    rows = np.flatnonzero(known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1]))[:_LOOK_AT]
+    at_ns, valid = counterparts(a, b, how, head.t_ns)
+    valid &= np.isfinite(head.position).all(axis=1)
+    rows = np.flatnonzero(valid & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1]))[:_LOOK_AT]
     there = interpolate(other.t_ns, other.position, at_ns[rows])
-    found = np.flatnonzero(np.isfinite(there).all(axis=1))
-    if not found.size:
+    finite = np.flatnonzero(np.isfinite(there).all(axis=1))
+    if not finite.size:
         return None
-    first = rows[found[0]]
-    heading, own = _heading(a, int(one.t_ns[first])), _heading(b, int(at_ns[first]))
-    if heading is None or own is None:
+    first = rows[finite[0]]
+    heading, other_heading = _heading(a, int(head.t_ns[first])), _heading(b, int(at_ns[first]))
+    if heading is None or other_heading is None:
         return None
-    turn = math.remainder(heading - own, 2 * math.pi)
-    step = one.position[first] - Placement(turn)(there[found[0]])
+    turn = math.remainder(heading - other_heading, 2 * math.pi)
+    step = head.position[first] - Placement(turn)(there[finite[0]])
     return Placement(turn, float(step[0]), float(step[1]))
 
 
@@ -379,13 +379,13 @@ def head_distance(a: Side, b: Side, how: Align, placed: Placement, t_ns: IntArra
     Returns:
         Distance on the ground [m], shape (n,); NaN where either isn't known.
     """
-    one, other = a.head, b.head
-    assert one is not None  # noqa: S101 - the caller drew both
+    head, other = a.head, b.head
+    assert head is not None  # noqa: S101 - the caller drew both
     assert other is not None  # noqa: S101
-    at_ns, known = counterparts(a, b, how, t_ns)
+    at_ns, valid = counterparts(a, b, how, t_ns)
     there = np.full((t_ns.size, 3), np.nan)
-    there[known] = placed(interpolate(other.t_ns, other.position, at_ns[known]))
-    apart = there - interpolate(one.t_ns, one.position, t_ns)
+    there[valid] = placed(interpolate(other.t_ns, other.position, at_ns[valid]))
+    apart = there - interpolate(head.t_ns, head.position, t_ns)
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
 
 
@@ -393,8 +393,8 @@ def _heading(side: Side, t_ns: int) -> float | None:
     """Return a body's heading in the cycle after a time [rad]; None if it isn't known."""
     times, rhythm = np.array([t_ns], dtype=np.int64), side.clock.rhythm
     if rhythm is not None:
-        ends, known = times_of(rhythm, interpolate(rhythm.t_ns, rhythm.cycles, times) + 1.0)
-        if known[0]:
+        ends, valid = times_of(rhythm, interpolate(rhythm.t_ns, rhythm.cycles, times) + 1.0)
+        if valid[0]:
             times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
     forward = _directions(side, times)
     forward = forward[np.isfinite(forward).all(axis=1)]
@@ -414,8 +414,8 @@ def _directions(side: Side, t_ns: IntArray) -> FloatArray:
     norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Between q and -q, which are the same pose, the straight line leaves the rotations.
     quaternion = np.where(norm > _ROTATION, quaternion / norm, np.nan)
-    names, known = robot.joint_names, {track.name for track in side.measured}
+    names, measured = robot.joint_names, {track.name for track in side.measured}
     angles = resampled(side.measured, names, t_ns, interpolate)
-    angles[:, [name not in known for name in names]] = 0.0  # as good a guess as any
+    angles[:, [name not in measured for name in names]] = 0.0  # as good a guess as any
     _, rotation = link_poses(robot, position, rotation_from_quaternion(quaternion), angles)
     return rotation[..., :2, 0].sum(axis=1)

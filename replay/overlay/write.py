@@ -152,7 +152,7 @@ class Overlay:
     Attributes:
         recording_id: Follows from the sessions' ids and names, and how they are aligned and placed.
         shown: What it holds of each session.
-        found: Result of the comparison with the first session, by the others' names.
+        outcomes: Result of the comparison with the first session, by the others' names.
         placements: How bodies are moved, by name; those that aren't are left out.
         warnings: What is missing or was assumed, a sentence each.
     """
@@ -160,7 +160,7 @@ class Overlay:
     path: Path
     recording_id: str
     shown: tuple[SessionContent, ...]
-    found: Mapping[str, Found]
+    outcomes: Mapping[str, Found]
     placements: Mapping[str, Placement]
     warnings: tuple[str, ...]
 
@@ -190,9 +190,9 @@ def write_overlay(
         for session in sessions
         for text in session.recording.warnings
     ]
-    found = {session.side.name: _compare(sessions[0], session) for session in sessions[1:]}
-    for name, one in found.items():
-        warnings += [f"{name} (B): {text}" if len(found) > 1 else text for text in one.notes]
+    outcomes = {session.side.name: _compare(sessions[0], session) for session in sessions[1:]}
+    for name, outcome in outcomes.items():
+        warnings += [f"{name} (B): {text}" if len(outcomes) > 1 else text for text in outcome.notes]
     placements = _placements(sessions, how, place, warnings)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
@@ -200,13 +200,13 @@ def write_overlay(
         check_stop(path, stop)
         send(rec, [_chunks(session) for session in sessions])
         check_stop(path, stop)
-        shown = _log(rec, sessions, found, placements, how)
+        shown = _log(rec, sessions, outcomes, placements, how)
         seen = [(session.side, session.seen) for session in sessions if session.seen is not None]
         quantities = draw.log_bars(rec, seen)
         title = _title(shown)
         text = words.markdown(
             sides,
-            found,
+            outcomes,
             how,
             has_cycles=any(side.rhythm is not None for side in sides),
             legend=_legend(shown, title),
@@ -214,14 +214,16 @@ def write_overlay(
         )
         log_facts(rec, text, words.FACTS)
         rec.send_blueprint(build_blueprint(shown, quantities, how, title))
-    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(warnings)))
+    return Overlay(path, identity, shown, outcomes, placements, tuple(dict.fromkeys(warnings)))
 
 
-def _chunks(one: Converted) -> LazyChunkStream:
+def _chunks(session: Converted) -> LazyChunkStream:
     """Return a session's own recording under its name and on the common timelines."""
-    side = one.side
+    side = session.side
     later_ns = side.start_ns - side.zero_ns
-    return chunks_of(one.recording.path, side.entity, later_ns=later_ns, more_cycles=side.cycles)
+    return chunks_of(
+        session.recording.path, side.entity, later_ns=later_ns, more_cycles=side.cycles
+    )
 
 
 def _compare(first: Converted, other: Converted) -> Found:
@@ -256,7 +258,7 @@ def _placements(
 def _log(
     rec: rr.RecordingStream,
     sessions: Sequence[Converted],
-    found: Mapping[str, Found],
+    outcomes: Mapping[str, Found],
     placements: Mapping[str, Placement],
     how: Align,
 ) -> tuple[SessionContent, ...]:
@@ -265,19 +267,21 @@ def _log(
     a, content = sessions[0].side, sessions[0].recording.content
     shown = [SessionContent(a, content, draw.log_lines(rec, a, 0, content.places))]
     for rank, session in enumerate(sessions[1:], start=1):
-        b, own = session.side, session.recording.content
+        b, other = session.side, session.recording.content
         placed = placements.get(b.name, Placement())
-        lines = draw.log_lines(rec, b, rank, draw.places_in(b, content.places, own.places))
+        lines = draw.log_lines(rec, b, rank, draw.places_in(b, content.places, other.places))
         angles = draw.angle_differences(a, b, how)
-        angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
+        angles = draw.log_differences(rec, a, f"{b.compared}{ANGLES}", angles, content.measured)
         apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))
-        bars = draw.log_difference_bars(rec, a, b, found[b.name].comparison)
-        shown.append(SessionContent(b, own, lines, angles, apart, bars))
-    bodies = [one.side for one in shown if one.body]
+        bars = draw.log_difference_bars(rec, a, b, outcomes[b.name].comparison)
+        shown.append(SessionContent(b, other, lines, angles, apart, bars))
+    bodies = [session.side for session in shown if session.body]
     for rank, side in enumerate(bodies):
         _log_body(rec, side, rank, placements)
     draw.log_ends(rec, bodies)
-    draw.log_power_names(rec, {k: one.side for k, one in enumerate(shown) if one.content.has_power})
+    draw.log_power_names(
+        rec, {k: session.side for k, session in enumerate(shown) if session.content.has_power}
+    )
     return tuple(shown)
 
 
@@ -290,18 +294,18 @@ def _log_apart(
 ) -> bool:
     """Write the distance of the heads, if both were tracked."""
     a, b = pair
-    one, other = a.head, b.head
-    if one is None or other is None or not (one.tracked and other.tracked):
+    head, other = a.head, b.head
+    if head is None or other is None or not (head.tracked and other.tracked):
         return False
-    t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
+    t_ns = head.t_ns[decimate(head.t_ns, _APART_RATE_HZ)]
     apart = head_distance(a, b, how, placed, t_ns)
-    known = bool(np.isfinite(apart).any())
-    if known:
+    drawn = bool(np.isfinite(apart).any())
+    if drawn:
         name = f"{b.name}, {a.name}"
-        plot = Plot(f"{b.own}{SEPARATE}", [(name,)])
+        plot = Plot(f"{b.compared}{SEPARATE}", [(name,)])
         plot.style(rec, {name: color})
         plot.write(rec, a.clock, [Track(name, t_ns, apart)])
-    return known
+    return drawn
 
 
 def _log_body(
@@ -318,14 +322,14 @@ def _log_body(
 
 def _title(shown: Sequence[SessionContent]) -> str:
     """Return the name of the bodies' view, which names the sessions."""
-    first, *others = [one.side.name for one in shown if one.body] or [""]
+    first, *others = [session.side.name for session in shown if session.body] or [""]
     if not others:
         return f"{first}; the others have no body" if first else ""
     return f"{first} solid, {' and '.join(others)} as wireframe"
 
 
 def _legend(shown: Sequence[SessionContent], title: str) -> str:
-    bodies = [one for one in shown if one.body]
+    bodies = [session for session in shown if session.body]
     if not bodies:
         return "No session has the data to draw a body."
     scale = body_title(bodies[0].content)
@@ -383,9 +387,9 @@ def combine_sessions(
         # Aligned before the long part, since that may refuse.
         aligned = align([read_side(session, name) for session, name in pairs], how)
         converted: list[Converted] = []
-        for k, ((session, name), one) in enumerate(zip(pairs, aligned, strict=True)):
+        for k, ((session, name), side) in enumerate(zip(pairs, aligned, strict=True)):
             step(f"recording of {name}")
-            converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
+            converted.append(Converted(side, *convert(session, folder / f"{k}.rrd")))
         step("side by side")
         return write_overlay(converted, path, how, place=place, stop=stop)
 

@@ -63,8 +63,8 @@ def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tu
         A track for each joint that has both [rad]; the command is the last one given by then.
     """
     return tuple(
-        Track(one.name, one.t_ns, one.values - hold(other.t_ns, other.values, one.t_ns))
-        for one, other in pairs(measured, commanded)
+        Track(track.name, track.t_ns, track.values - hold(other.t_ns, other.values, track.t_ns))
+        for track, other in pairs(measured, commanded)
     )
 
 
@@ -77,7 +77,9 @@ def mechanical_power(columns: Columns) -> tuple[Track, ...]:
     Returns:
         A track [W] for each joint with effort and velocity; positive where the joint drives.
     """
-    effort, velocity = (columns.get(("/joint_states", one), ()) for one in ("effort", "velocity"))
+    effort, velocity = (
+        columns.get(("/joint_states", field), ()) for field in ("effort", "velocity")
+    )
     return products(effort, velocity)
 
 
@@ -103,8 +105,10 @@ def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ..
         A track for each joint that has both; NaN where either is missing.
     """
     return tuple(
-        Track(one.name, one.t_ns, one.values * interpolate(other.t_ns, other.values, one.t_ns))
-        for one, other in pairs(first, second)
+        Track(
+            track.name, track.t_ns, track.values * interpolate(other.t_ns, other.values, track.t_ns)
+        )
+        for track, other in pairs(first, second)
     )
 
 
@@ -134,8 +138,8 @@ def power_limit(power_w: FloatArray) -> float:
         [W], rounded up to two digits so that it can be written beside the picture; 1 where no
         power is known or all of it is zero.
     """
-    known = np.abs(power_w[np.isfinite(power_w)])
-    limit = float(np.percentile(known, 99.0)) if known.size else 0.0
+    magnitude = np.abs(power_w[np.isfinite(power_w)])
+    limit = float(np.percentile(magnitude, 99.0)) if magnitude.size else 0.0
     if not limit:
         return 1.0
     unit = 10.0 ** (np.floor(np.log10(limit)) - 1.0)
@@ -185,7 +189,7 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
     measured = columns.get(("/joint_states", "position"), ())
     commanded = columns.get(("/joint_commands", "position"), ())
     mechanical, electrical = mechanical_power(columns), electrical_power(columns)
-    found = {
+    lines = {
         COMMANDED: commanded,
         MEASURED: measured,
         ERROR: tracking_errors(measured, commanded),
@@ -193,13 +197,13 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
     }
     for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
         if (whole := total(tracks)) is not None:
-            found[f"{TOTAL}/{kind}"] = (whole,)
-    found |= {
+            lines[f"{TOTAL}/{kind}"] = (whole,)
+    lines |= {
         topic_entity(SIGNALS, topic): tracks
         for (topic, field), tracks in columns.items()
         if topic not in DRAWN and field == "position"
     }
-    return {entity: tracks for entity, tracks in found.items() if tracks}
+    return {entity: tracks for entity, tracks in lines.items() if tracks}
 
 
 @dataclass(frozen=True)
@@ -244,8 +248,8 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         read_ns = sum(stop_ns - start_ns for start_ns, stop_ns in looks)
         share = read_ns / (session.end_ns - session.start_ns)
         begin = session.view(stop_ns=looks[0][1])
-    wanted = _carried(begin)
-    every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in wanted}
+    topics = _carried(begin)
+    every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in topics}
     thin = max(every.values(), default=1)
     takes_turns = any(topic in session.channels for topic in OFFSETS)
     names = () if session.robot is None else session.robot.joint_names
@@ -256,17 +260,17 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     powers: list[FloatArray] = []
     seen: dict[tuple[str, str], set[str]] = {}
     context_ns = _LEAST_CONTEXT_NS
-    for columns in _columns(session, wanted, looks):
+    for columns in _columns(session, topics, looks):
         for key, tracks in columns.items():
             seen.setdefault(key, set()).update(track.name for track in tracks)
             reaches_ns = (round(_REACH_STEPS * typical_step_ns(track.t_ns)) for track in tracks)
             context_ns = max(context_ns, *reaches_ns)
         for entity, tracks in quantities(columns).items():
-            own = lines.setdefault(entity, {})
+            by_name = lines.setdefault(entity, {})
             for track in tracks:
                 # Not a view, which keeps all.
                 some = Track(track.name, track.t_ns[::thin].copy(), track.values[::thin].copy())
-                own.setdefault(track.name, []).append(some)
+                by_name.setdefault(track.name, []).append(some)
             parts[entity] = refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
             if entity == MEASURED:
                 times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
@@ -274,7 +278,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
                 power = resampled(tracks, names, tracks[0].t_ns[::thin], interpolate)
                 powers.append(segment_power(power))
     return Survey(
-        topics={topic: fields for topic, fields in wanted.items() if fields},
+        topics={topic: fields for topic, fields in topics.items() if fields},
         samples={
             entity: tuple(
                 one_after_another(line[name])
@@ -303,13 +307,13 @@ def _looks(session: SessionView) -> list[tuple[int, int]]:
 
 
 def _columns(
-    session: SessionView, wanted: Mapping[str, Sequence[str]], looks: Sequence[tuple[int, int]]
+    session: SessionView, topics: Mapping[str, Sequence[str]], looks: Sequence[tuple[int, int]]
 ) -> Iterator[Columns]:
     """Columns of windows of a session; without windows, of all of it, stretch by stretch."""
     if not looks:
-        yield from (stretch.columns for stretch in stretches(session, wanted, 0))
+        yield from (stretch.columns for stretch in stretches(session, topics, 0))
     for start_ns, stop_ns in looks:
-        columns = read_columns(session, wanted, start_ns=start_ns, stop_ns=stop_ns)
+        columns = read_columns(session, topics, start_ns=start_ns, stop_ns=stop_ns)
         session.forget()
         yield columns
 
@@ -319,24 +323,20 @@ def _carried(session: SessionView) -> dict[str, list[str]]:
 
     They are searched in the first second, and if one is missing in the whole session, once.
     """
-    wanted = {
-        topic: wanted_field
-        for topic, wanted_field in wanted_fields(session).items()
-        if topic != GAIT
-    }
+    topics = {topic: fields for topic, fields in wanted_fields(session).items() if topic != GAIT}
     stop_ns = session.start_ns + 1_000_000_000
     try:
-        session.joint_columns(wanted, stop_ns=stop_ns)
+        session.joint_columns(topics, stop_ns=stop_ns)
     except (MissingChannelError, DataError):
-        every = wanted.items()
+        every = topics.items()
         return {k: [field for field in fields if comes(session, k, field)] for k, fields in every}
-    return wanted
+    return topics
 
 
-def comes(session: SessionView, topic: str, one: str) -> bool:
+def comes(session: SessionView, topic: str, field: str) -> bool:
     """Whether a field of a JointState topic ever comes."""
     try:
-        session.joints(topic, one)
+        session.joints(topic, field)
     except (MissingChannelError, DataError):
         return False
     return True
@@ -344,15 +344,15 @@ def comes(session: SessionView, topic: str, one: str) -> bool:
 
 def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:
     """Lines that were sampled together, or by one message in turn."""
-    found: list[tuple[IntArray, list[str]]] = []
+    groups: list[tuple[IntArray, list[str]]] = []
     for track in tracks:
-        for t_ns, names in found:
+        for t_ns, names in groups:
             if np.array_equal(t_ns, track.t_ns) or (turns and in_turn(t_ns, track.t_ns)):
                 names.append(track.name)
                 break
         else:
-            found.append((track.t_ns, [track.name]))
-    return [tuple(names) for _, names in found]
+            groups.append((track.t_ns, [track.name]))
+    return [tuple(names) for _, names in groups]
 
 
 def refined(
@@ -360,16 +360,16 @@ def refined(
 ) -> list[tuple[str, ...]]:
     """Return parts that are together in both; a line in one of them only follows that one."""
     label = {name: i for i, part in enumerate(now) for name in part}
-    found: list[tuple[str, ...]] = []
+    parts: list[tuple[str, ...]] = []
     for part in before:
         split: dict[int, list[str]] = {}
         first = next((label[name] for name in part if name in label), -1)
         for name in part:
             split.setdefault(label.get(name, first), []).append(name)
-        found += [tuple(names) for names in split.values()]
-    known = {name for part in before for name in part}
-    found += [new for part in now if (new := tuple(n for n in part if n not in known))]
-    return found
+        parts += [tuple(names) for names in split.values()]
+    earlier = {name for part in before for name in part}
+    parts += [new for part in now if (new := tuple(n for n in part if n not in earlier))]
+    return parts
 
 
 def _in_order(

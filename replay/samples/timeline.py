@@ -70,7 +70,7 @@ class SpanSamples:
 
 
 def stretches(
-    session: SessionView, wanted: Mapping[str, Sequence[str]], context_ns: int
+    session: SessionView, topics: Mapping[str, Sequence[str]], context_ns: int
 ) -> Iterator[SpanSamples]:
     """Read a session stretch by stretch.
 
@@ -89,7 +89,7 @@ def stretches(
         high = start_ns + (i + 1) * length_ns if i + 1 < count else None
         known_ns = None if high is None else high + context_ns
         begin_ns = None if low is None else low - context_ns
-        columns = read_columns(session, wanted, start_ns=begin_ns, stop_ns=known_ns)
+        columns = read_columns(session, topics, start_ns=begin_ns, stop_ns=known_ns)
         span = DrawnSpan(
             _FIRST_NS if low is None else low, _LAST_NS if high is None else high, known_ns
         )
@@ -155,8 +155,8 @@ class LoggedRhythm:
         Returns:
             The rhythm; samples without a phase are left out.
         """
-        known = np.isfinite(phase_rad)
-        return cls(t_ns[known], np.unwrap(phase_rad[known]) / (2.0 * np.pi))
+        finite = np.isfinite(phase_rad)
+        return cls(t_ns[finite], np.unwrap(phase_rad[finite]) / (2.0 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -184,11 +184,11 @@ class TimeColumns:
             Runs of at most ``ROWS_PER_CHUNK`` rows, with their time columns.
         """
         cycles = self._cycles(t_ns)
-        known = np.isfinite(cycles)
-        for part in _runs(known):
+        finite = np.isfinite(cycles)
+        for part in _runs(finite):
             since = (t_ns[part] - self.start_ns).astype("timedelta64[ns]")
             columns = [rr.TimeColumn(SESSION_TIME, duration=since)]
-            if known[part.start]:
+            if finite[part.start]:
                 beat = np.round(cycles[part] * 1e9).astype("timedelta64[ns]")
                 columns.append(rr.TimeColumn(GAIT_CYCLE, duration=beat))
             yield part, columns
@@ -199,9 +199,9 @@ class TimeColumns:
         return interpolate(self.rhythm.t_ns, self.rhythm.cycles, t_ns)
 
 
-def _runs(known: BoolArray) -> Iterator[slice]:
-    """Runs of equal value in ``known``, each cut into chunks."""
-    edges = np.flatnonzero(np.diff(known)) + 1
-    for start, stop in zip([0, *edges], [*edges, known.size], strict=True):
+def _runs(mask: BoolArray) -> Iterator[slice]:
+    """Runs of equal value in ``mask``, each cut into chunks."""
+    edges = np.flatnonzero(np.diff(mask)) + 1
+    for start, stop in zip([0, *edges], [*edges, mask.size], strict=True):
         for low in range(int(start), int(stop), ROWS_PER_CHUNK):
             yield slice(low, min(low + ROWS_PER_CHUNK, int(stop)))

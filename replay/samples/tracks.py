@@ -99,15 +99,15 @@ def wanted_fields(session: SessionView) -> dict[str, list[str]]:
     Returns:
         Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
     """
-    wanted = {topic: ["position"] for topic in drawn_topics(session)[0]}
-    if "/joint_states" in wanted:
-        wanted["/joint_states"] += ["velocity", "effort"]
-    return wanted
+    fields = {topic: ["position"] for topic in drawn_topics(session)[0]}
+    if "/joint_states" in fields:
+        fields["/joint_states"] += ["velocity", "effort"]
+    return fields
 
 
 def read_columns(
     session: SessionView,
-    wanted: Mapping[str, Sequence[str]] | None = None,
+    topics: Mapping[str, Sequence[str]] | None = None,
     *,
     start_ns: int | None = None,
     stop_ns: int | None = None,
@@ -115,7 +115,7 @@ def read_columns(
     """Read JointState topics of a session.
 
     Args:
-        wanted: Topic to fields; None for all of :func:`wanted_fields`.
+        topics: Topic to fields; None for all of :func:`wanted_fields`.
         start_ns: First sampling time wanted [Unix ns]; None for the session's start.
         stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
 
@@ -126,21 +126,21 @@ def read_columns(
     Raises:
         DataError: If a topic has more than :data:`MOST_JOINTS`.
     """
-    fields = wanted_fields(session) if wanted is None else wanted
+    fields = wanted_fields(session) if topics is None else topics
     window = {"start_ns": start_ns, "stop_ns": stop_ns}
     try:
         columns = session.joint_columns(fields, **window)
     except (MissingChannelError, DataError):  # a field that never comes: take the others singly
         columns: dict[tuple[str, str], JointSignals] = {}
-        for topic, field in [(one, field) for one in fields for field in fields[one]]:
+        for topic, field in [(name, field) for name in fields for field in fields[name]]:
             with contextlib.suppress(MissingChannelError, DataError):
                 columns[topic, field] = session.joints(topic, field, **window)
     for (topic, _), signals in columns.items():
         if (count := len(signals.names)) > MOST_JOINTS:
             where = f"{session.path.name}: {topic} has {count} joints"
             raise DataError(f"{where}; at most {MOST_JOINTS} are drawn")
-    found = {key: _tracks(signals) for key, signals in columns.items()}
-    return {key: tracks for key, tracks in found.items() if tracks}
+    by_field = {key: _tracks(signals) for key, signals in columns.items()}
+    return {key: tracks for key, tracks in by_field.items() if tracks}
 
 
 def _tracks(signals: JointSignals) -> tuple[Track, ...]:
@@ -158,9 +158,9 @@ def without_filler(track: Track) -> Track:
     Returns:
         The track without its NaN where they are half or more, else the track itself.
     """
-    known = np.isfinite(track.values)
-    whole = 2 * np.count_nonzero(known) > known.size
-    return track if whole else Track(track.name, track.t_ns[known], track.values[known])
+    finite = np.isfinite(track.values)
+    whole = 2 * np.count_nonzero(finite) > finite.size
+    return track if whole else Track(track.name, track.t_ns[finite], track.values[finite])
 
 
 def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, Track]]:
@@ -247,11 +247,11 @@ def resampled(
     Returns:
         Shape (n, number of names); NaN columns for joints without a track.
     """
-    found = np.full((at_ns.size, len(names)), np.nan)
+    values = np.full((at_ns.size, len(names)), np.nan)
     column = {name: i for i, name in enumerate(names)}
     for table in tables([track for track in tracks if track.name in column]):
-        found[:, [column[name] for name in table.names]] = method(table.t_ns, table.values, at_ns)
-    return found
+        values[:, [column[name] for name in table.names]] = method(table.t_ns, table.values, at_ns)
+    return values
 
 
 def plot_step(values: FloatArray) -> float:
@@ -265,11 +265,11 @@ def plot_step(values: FloatArray) -> float:
         hundredth of the samples, so that rounding moves none by more than a thousandth of that
         range; 0, for none, where the line is flat.
     """
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return 0.0
-    low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL])
-    span = float(high - low) or float(known.max() - known.min())
+    low, high = np.quantile(finite, [_TAIL, 1.0 - _TAIL])
+    span = float(high - low) or float(finite.max() - finite.min())
     return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span else 0.0
 
 
@@ -287,9 +287,9 @@ def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArr
     some = step > 0.0
     if not some.any():
         return values
-    found = values.copy()
-    found[:, some] = np.round(values[:, some] / step[some]) * step[some]
-    return found
+    result = values.copy()
+    result[:, some] = np.round(values[:, some] / step[some]) * step[some]
+    return result
 
 
 def typical_step_ns(t_ns: IntArray) -> int:
@@ -385,18 +385,18 @@ def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArr
     """
     if np.array_equal(t_ns, at_ns):
         return values
-    found = np.full((at_ns.size, *values.shape[1:]), np.nan)
+    result = np.full((at_ns.size, *values.shape[1:]), np.nan)
     if not t_ns.size:
-        return found
+        return result
     left = np.searchsorted(t_ns, at_ns, side="right") - 1  # -1, the last, where none is earlier
     exact = t_ns[left] == at_ns
-    found[exact] = values[left[exact]]
+    result[exact] = values[left[exact]]
     between = ~exact & np.append(~gaps(t_ns), False)[left]  # nothing follows the last
     i = left[between]
     share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
     share = share.reshape(-1, *[1] * (values.ndim - 1))
-    found[between] = (1.0 - share) * values[i] + share * values[i + 1]
-    return found
+    result[between] = (1.0 - share) * values[i] + share * values[i + 1]
+    return result
 
 
 def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
@@ -411,13 +411,13 @@ def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
         Shape (m,) or (m, k); NaN before the first sample and later than a gap's length after
         the last one, where a lost command can't be distinguished from a held one.
     """
-    found = np.full((at_ns.size, *values.shape[1:]), np.nan)
+    result = np.full((at_ns.size, *values.shape[1:]), np.nan)
     if not t_ns.size:
-        return found
+        return result
     left = np.searchsorted(t_ns, at_ns, side="right") - 1
-    known = (left >= 0) & (at_ns - t_ns[left] <= GAP_STEPS * typical_step_ns(t_ns))
-    found[known] = values[left[known]]
-    return found
+    held = (left >= 0) & (at_ns - t_ns[left] <= GAP_STEPS * typical_step_ns(t_ns))
+    result[held] = values[left[held]]
+    return result
 
 
 def ordered(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:

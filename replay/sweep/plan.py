@@ -169,8 +169,8 @@ def read_plan(path: Path) -> SweepPlan:
     if len(plan.scenario) > _LONGEST_NAME or not plan.scenario.isprintable():
         top.fault("scenario", f"a name or path of at most {_LONGEST_NAME} printed characters")
     _check_size(top, plan)
-    if found := faults.all():
-        raise PlanError(path, found)
+    if problems := faults.all():
+        raise PlanError(path, problems)
     return plan
 
 
@@ -200,11 +200,11 @@ def _parameters(top: StrictTable) -> tuple[Parameter, ...]:
     if len(names) > _MOST_PARAMETERS:
         top.fault(name, f"at most {_MOST_PARAMETERS} parameters", str(len(names)))
         return ()
-    found = tuple(_parameter(key, table.table(key)) for key in names)
+    parameters = tuple(_parameter(key, table.table(key)) for key in names)
     if "seed" in value:
         table.fault("seed", "left out: seeds and first_seed say it")
     table.close()
-    return found
+    return parameters
 
 
 def _parameter(key: str, table: StrictTable) -> Parameter:

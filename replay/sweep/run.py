@@ -119,13 +119,13 @@ def software() -> dict[str, str]:
                 digest.update(path.relative_to(root).as_posix().encode() + b"\0")
                 digest.update(path.read_bytes())
     digest.update(Path(__file__).read_bytes())
-    found = {"python": platform.python_version(), "source": digest.hexdigest()[:32]}
+    versions = {"python": platform.python_version(), "source": digest.hexdigest()[:32]}
     for name in _PACKAGES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def digest_of(facts: Mapping[str, Any]) -> str:
@@ -170,8 +170,8 @@ def options_of(setting: Setting, changes: Mapping[str, Any]) -> Options:
     faults = Faults()
     given = {key: value for key, value in asdict(setting.options).items() if value is not None}
     options = read(StrictTable(given | of_analysis, "analysis", faults), Options)
-    if found := faults.all():
-        raise PlanError(setting.name, found)
+    if problems := faults.all():
+        raise PlanError(setting.name, problems)
     return options
 
 
@@ -288,9 +288,9 @@ def result_columns(result: Analysis) -> Row:
     if result.energy is not None:
         transport = result.energy.transport
         single |= {"distance_m": transport.distance_m, "cost_of_transport": transport.abs}
-    for name, one in single.items():
-        own = _columns(name, [(one.value, one.ci95)])
-        columns |= {column: value for column, (value,) in own.items()}
+    for name, estimate in single.items():
+        cells = _columns(name, [(estimate.value, estimate.ci95)])
+        columns |= {column: value for column, (value,) in cells.items()}
     return columns
 
 

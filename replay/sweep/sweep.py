@@ -131,12 +131,12 @@ def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
             points that don't fit become failed rows.
     """
     beside = folder / plan.scenario
-    found = scenario_text(beside if is_file(beside) else plan.scenario)
+    scenario = scenario_text(beside if is_file(beside) else plan.scenario)
     address = output if "://" in output else str(Path(output).resolve())
     setting = Setting(
-        scenario=found.text,
-        name=found.source.name,
-        robots=_robots(plan, found.text, found.source.parent),
+        scenario=scenario.text,
+        name=scenario.source.name,
+        robots=_robots(plan, scenario.text, scenario.source.parent),
         duration_s=plan.duration_s,
         kernels=plan.kernels,
         options=plan.analysis,
@@ -224,8 +224,8 @@ def run_sweep(
             elif isinstance(workers, LocalWorkers):
                 rows = run_local(sweep.setting, jobs, workers, stop)
             else:
-                own = stack.enter_context(LocalWorkers(workers or processors()))
-                rows = run_local(sweep.setting, jobs, own, stop)
+                local = stack.enter_context(LocalWorkers(workers or processors()))
+                rows = run_local(sweep.setting, jobs, local, stop)
             stack.enter_context(closing(rows))
             for row in rows:
                 store.add({"setting": sweep.digest, **row})

@@ -117,7 +117,7 @@ def run_local(
     try:
         while True:
             if stop.requested:
-                running = {one: job for one, job in running.items() if not one.cancel()}
+                running = {future: job for future, job in running.items() if not future.cancel()}
             while len(running) < _AHEAD * workers.count and not stop.requested:
                 if (job := queue.next()) is None:
                     break

@@ -140,7 +140,7 @@ def test_the_level_is_of_all_joints_and_checks_together():
     plays = tuple(SimpleNamespace(p=p, widens=False) for p in (0.004, 0.3, 0.8))
     both = LackOfFit(joints, Unfitted(0.9, 1e-3, 1e-3), plays, (1.0,))
     assert both.p == pytest.approx(3 * 3 * 0.004)
-    assert both.found
+    assert both.significant
     assert both.worst == "a"
 
 

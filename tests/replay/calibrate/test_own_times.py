@@ -60,7 +60,7 @@ def test_stamps_beside_the_ticks_give_the_same_parameters(strong):
         for name, stamps in STAMPS.items()
     }
     for name, most in (("exact", 1.0), ("rounded", 1.2), ("jittered", 2.0)):
-        assert not fits[name].lack.found
+        assert not fits[name].lack.significant
         for mine, best in zip(fits[name].parameters, fits["exact"].parameters, strict=True):
             assert mine.ci95[0] <= best.value <= mine.ci95[1]
             assert width(mine) <= most * width(best)
@@ -104,7 +104,7 @@ def test_sessions_of_different_servos_are_refused(strong, tmp_path, command):
     a = restamped(strong / "run.mcap", tmp_path / "a.mcap", exact, noise=NOISE, seed=4)
     b = restamped(tmp_path / "b.mcap", tmp_path / "c.mcap", exact, noise=NOISE, seed=5)
     lack = fit([a, b], strong, ("stall_torque",)).lack
-    assert lack.found
+    assert lack.significant
     assert lack.unfitted.by_session
     assert lack.unfitted.p < 1e-3
     words = ("sim", "fit", strong / "run.mcap", tmp_path / "b.mcap", "--only", "stall_torque")
@@ -120,7 +120,7 @@ def test_a_finer_twin_is_within_the_intervals_and_not_refused(noise, tmp_path):
     room_for(tmp_path, 3, 5.0, hidden_of(truth), noise=0.0, rate_hz=5000)
     path = restamped(tmp_path / "run.mcap", tmp_path / "a.mcap", exact, noise=noise, seed=78)
     found = fit([path], tmp_path)
-    assert not found.lack.found
+    assert not found.lack.significant
     assert found.step.rms > 2e-4
     for parameter in found.parameters:
         assert parameter.ci95[0] <= truth[parameter.name] <= parameter.ci95[1]
@@ -141,8 +141,8 @@ def test_intervals_cover_and_the_right_law_is_left_alone(tmp_path):
             path = room / f"{name}.mcap"
             restamped(room / "run.mcap", path, stamps, noise=NOISE, seed=number)
             found = fit([path], room)
-            refused.append(found.lack.found)
-            if found.lack.found:
+            refused.append(found.lack.significant)
+            if found.lack.significant:
                 continue
             best = found if name == "exact" else best
             inside[name] += [p.ci95[0] <= truth[p.name] <= p.ci95[1] for p in found.parameters]
@@ -184,7 +184,7 @@ def test_a_wrong_law_of_three_times_the_noise_is_refused(tmp_path):
                 path = room / f"{name}.mcap"
                 restamped(room / "run.mcap", path, stamps, noise=misfit / 3, seed=number)
                 lack = fit([path], room).lack
-                refused.append(lack.found)
+                refused.append(lack.significant)
                 named = lack.explanation
                 print(law, number, name, f"{misfit:.2g} rad, p {lack.p:.2g}", named and named.label)
                 assert named is None or named.size > 0.0
