@@ -307,10 +307,10 @@ def run(arguments: Sequence[str]) -> int:
     except CycloptsError as error:
         return _complain(f"{error}\nTry 'undulog --help', or --help after the command.", 2)
     except (UndulogError, ImportError) as error:
-        known = error if isinstance(error, UndulogError) else _missing_extra(error, arguments)
-        if known is None:
+        foreseen = error if isinstance(error, UndulogError) else _missing_extra(error, arguments)
+        if foreseen is None:
             raise
-        return _complain(str(known), known.exit_code)
+        return _complain(str(foreseen), foreseen.exit_code)
     except (OSError, UnicodeEncodeError) as error:
         fault = _file_fault(error)
         if fault is None:

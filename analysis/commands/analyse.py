@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import SessionLine, are_as_given, sessions_of
-from undulog.capture.commands.sessions import each as each_session
+from undulog.capture.commands.sessions import SessionLine, are_as_given, each_session, sessions_of
 from undulog.capture.commands.sessions import show as show_table
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import Progress, echo, emit_json, output_width, progress

@@ -10,8 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import FAILED, SessionLine, are_as_given, sessions_of, show
-from undulog.capture.commands.sessions import each as each_session
+from undulog.capture.commands.sessions import (
+    FAILED,
+    SessionLine,
+    are_as_given,
+    each_session,
+    sessions_of,
+    show,
+)
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError

@@ -17,7 +17,7 @@ from ..common.errors import DataError, UsageError
 from ..common.part_files import SUFFIX
 from ..log.file.content import session_label
 from ..log.messages.definitions import CONTRACT_VERSION
-from .sessions import SessionLine, each, sessions_of, show, stated_gait
+from .sessions import SessionLine, each_session, sessions_of, show, stated_gait
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def log_info(file: Path, /, *more: Path, json: bool = False) -> int:
 
     paths = sessions_of([file, *more])
     if len(paths) > 1:
-        return show(each(paths, "log info", _info_line), as_json=json)
+        return show(each_session(paths, "log info", _info_line), as_json=json)
     with Session.open(paths[0]) as session:
         facts = describe(session)
     emit(facts, _info_lines(facts), as_json=json)
@@ -225,7 +225,7 @@ def log_check(
         return _check_contracts(paths, as_json=json)
     if len(paths) > 1:
         work = partial(_check_line, topics=topics)
-        return show(each(paths, "log check", work), as_json=json)
+        return show(each_session(paths, "log check", work), as_json=json)
     (file,) = paths
     with progress(f"checking {file.name}", 1.0) as bar:
         health = check_session(file, bar.update, topics=topics.names)
@@ -237,7 +237,7 @@ def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
     from ..log.health.contract import RULES, check_contract
 
     if len(paths) > 1:
-        return show(each(paths, "log check", _contract_line), as_json=as_json)
+        return show(each_session(paths, "log check", _contract_line), as_json=as_json)
     (path,) = paths
     contract = check_contract(path)
     facts = _contract_facts(path, contract)

@@ -111,7 +111,7 @@ def _session_of(path: Path) -> Path:
     return first_part(path) if path.suffix == ".mcap" and not path.is_dir() else path
 
 
-def each(
+def each_session(
     what: Sequence[Any], verb: str, work: Callable[[Any], SessionLine]
 ) -> dict[str, SessionLine]:
     """Do the work on each session, with progress on a terminal; one that fails has a line of why.

@@ -149,12 +149,12 @@ def run_batch(
     for scenario in scenarios:
         _refuse(scenario, driven=commands is not None)
     if commands is None:
-        known: _Commands = {}
-        commands = [_commands(scenario, known) for scenario in scenarios]
+        cache: _Commands = {}
+        commands = [_commands(scenario, cache) for scenario in scenarios]
     else:
         commands = [
-            quantised(one, scenario.sensing.servo.command_resolution)
-            for scenario, one in zip(scenarios, commands, strict=True)
+            quantised(command, scenario.sensing.servo.command_resolution)
+            for scenario, command in zip(scenarios, commands, strict=True)
         ]
     for scenario, command in zip(scenarios, commands, strict=True):
         _check_shape(command, scenario)
@@ -202,9 +202,9 @@ def _refuse(scenario: Scenario, *, driven: bool) -> None:
     if isinstance(scenario.gait, OscillatorChains) and not driven:
         for plane, chain in scenario.gait.planes.items():
             needs[f"gait.{plane}.feedback"] = chain.feedback > 0.0
-    if found := [name for name, needed in needs.items() if needed]:
+    if fields := [name for name, needed in needs.items() if needed]:
         raise UsageError(
-            f"a batch can't run scenario {scenario.name}: it has {', '.join(found)}; leave out "
+            f"a batch can't run scenario {scenario.name}: it has {', '.join(fields)}; leave out "
             "what it has, or use Twin or record"
         )
 
@@ -229,12 +229,12 @@ def _check_shape(commands: FloatArray, scenario: Scenario) -> None:
         )
 
 
-def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
+def _commands(scenario: Scenario, cache: _Commands) -> FloatArray:
     """Commands of all ticks, shape (k, m), computed once for runs that share them."""
     resolution = scenario.sensing.servo.command_resolution
     limits = tuple((joint.plane, joint.lower, joint.upper) for joint in scenario.robot.joints)
     key = (id(scenario.gait), limits, scenario.tick_count, resolution)
-    if key not in known:
+    if key not in cache:
         times_s = np.arange(scenario.tick_count) / CONTROL_RATE_HZ
         gait = generator(scenario.gait, scenario.robot)
         if isinstance(gait, SerpentineGait):
@@ -242,8 +242,8 @@ def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
         else:
             unknown = Readings.nothing(scenario.robot)
             commands = np.array([gait.step(t, unknown).command for t in times_s.tolist()])
-        known[key] = quantised(commands, resolution)
-    return known[key]
+        cache[key] = quantised(commands, resolution)
+    return cache[key]
 
 
 def _chain(robot: Robot) -> FloatArray:
@@ -276,11 +276,11 @@ class _Block:
         """Set the robots on the ground, straight, their servos at rest."""
         self._scenarios = scenarios
         lanes = [scenarios[min(r, len(scenarios) - 1)] for r in range(width)]
-        one = scenarios[0]
-        n, m, ticks = len(one.robot.links), len(one.robot.joints), one.tick_count
-        self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in one.robot.joints])
-        self._law = 0 if one.world.ground is None else LAWS.index(one.world.ground.law)
-        self._steps = one.physics_rate_hz // CONTROL_RATE_HZ
+        first = scenarios[0]
+        n, m, ticks = len(first.robot.links), len(first.robot.joints), first.tick_count
+        self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in first.robot.joints])
+        self._law = 0 if first.world.ground is None else LAWS.index(first.world.ground.law)
+        self._steps = first.physics_rate_hz // CONTROL_RATE_HZ
         self._links = np.zeros((n, LINK_ROWS, width), dtype)
         self._head = np.zeros((HEAD_ROWS, width), dtype)
         self._carried = np.zeros((CARRIED_ROWS, width), dtype)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import SessionLine, each, sessions_of, show
+from undulog.capture.commands.sessions import SessionLine, each_session, sessions_of, show
 from undulog.capture.commands.topic_options import CommandTopic
 from undulog.capture.common.console import (
     UNLIMITED,
@@ -78,8 +78,8 @@ class BusDrive:
                 "-o, e.g. -o drive.mcap"
             )
         recorder = self.recorder or _only_recorder()
-        wanted = self.output, self.robot, self.duration_s
-        plan = bus_plan(self.driven, self.on, *wanted, recorder=recorder, force=self.force)
+        settings = self.output, self.robot, self.duration_s
+        plan = bus_plan(self.driven, self.on, *settings, recorder=recorder, force=self.force)
         console = ConsoleWatch()
         start = time.monotonic()
         with interruptible(twice=True) as stop, progress(plan.driven.name, plan.duration_s) as bar:
@@ -169,7 +169,7 @@ def _dry_runs(
         facts = {"on": on, **reported(dry)}
         return SessionLine(dry.scenario.robot.name, driven.name, verdict, first, facts, verdict.fit)
 
-    return each(whats, "dry run", line)
+    return each_session(whats, "dry run", line)
 
 
 def _twin_runs(
@@ -209,19 +209,21 @@ def _twin_runs(
         first = _summary(driven, scenario, recording, factor)[0]
         return SessionLine(scenario.robot.name, driven.name, "good", first, facts)
 
-    return each(whats, "drive", line)
+    return each_session(whats, "drive", line)
 
 
 def _motions(given: Sequence[str]) -> list[str]:
     """Return what is named: of a folder its TOML files and sessions, of a pattern what fits it."""
     from ..scenario.scenario_file import scenario_names
 
-    found: list[str] = []
+    motions: list[str] = []
     for what in given:
         plans = sorted(Path(what).glob("*.toml")) if what not in scenario_names() else []
-        sessions = [one for one in sessions_of([Path(what)]) if str(one) != str(Path(what))]
-        found += map(str, [*plans, *sessions]) if plans or sessions else [what]
-    return found
+        sessions = [
+            session for session in sessions_of([Path(what)]) if str(session) != str(Path(what))
+        ]
+        motions += map(str, [*plans, *sessions]) if plans or sessions else [what]
+    return motions
 
 
 def drive(

@@ -124,7 +124,7 @@ def null(
         "robot": model.robot,
         "frequency_hz": model.frequency_hz,
         "joints": list(model.joints),
-        "parameters": {one.name: one.value for one in model.parameters},
+        "parameters": {parameter.name: parameter.value for parameter in model.parameters},
         "error": model.error,
     }
     driven = f"{len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} Hz"
@@ -249,7 +249,7 @@ def with_progress(
 
 def _listed(scenarios: Sequence[Scenario], columns: int) -> list[str]:
     """Lines that list scenarios, by robot, the descriptions wrapped to the terminal."""
-    name_width = max(len(one.name) for one in scenarios)
+    name_width = max(len(scenario.name) for scenario in scenarios)
     by_robot: dict[str, list[Scenario]] = {}
     for scenario in scenarios:
         by_robot.setdefault(scenario.robot.name, []).append(scenario)
@@ -352,17 +352,17 @@ def show(scenario: str, /, *, json: bool = False) -> None:
 
     from ..scenario.scenario_file import load_scenario
 
-    found = load_scenario(scenario)
-    every = dict(leaves(read_toml(found.toml())))
+    chosen = load_scenario(scenario)
+    every = dict(leaves(read_toml(chosen.toml())))
     values = {
         key: {"value": value, "unit": unit_of(key) if _is_number(value) else ""}
         for key, value in every.items()
         if key not in _HEAD
     }
-    robot = found.robot
+    robot = chosen.robot
     facts = {
-        "name": found.name,
-        "description": found.description,
+        "name": chosen.name,
+        "description": chosen.description,
         "robot": {"name": robot.name, "joints": len(robot.joints), "mass_kg": robot.total_mass},
         "values": values,
     }
@@ -372,7 +372,7 @@ def show(scenario: str, /, *, json: bool = False) -> None:
     ]
     texts, _ = table(_COLUMNS, rows, UNLIMITED)
     lines = [
-        f"{found.name}: {found.description}",
+        f"{chosen.name}: {chosen.description}",
         f"robot {robot.name}: {len(robot.joints)} joints, {robot.total_mass:.3g} kg",
         "",
         *(text.plain.rstrip() for text in texts),
@@ -382,7 +382,7 @@ def show(scenario: str, /, *, json: bool = False) -> None:
 
 def _is_number(value: Any) -> bool:
     every = cast("list[object]", value) if isinstance(value, list) else [value]
-    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in every)
+    return all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in every)
 
 
 def unit_of(key: str) -> str | None:

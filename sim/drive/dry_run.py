@@ -129,7 +129,7 @@ class DryRun:
         """The joint and the quantity that come closest to a limit, or go farthest beyond it."""
         demands = ((joint.name, demand) for joint in self.joints for demand in joint.demands)
         finite = (demand for demand in demands if math.isfinite(demand[1].share))
-        return max(finite, key=lambda one: one[1].share, default=None)
+        return max(finite, key=lambda pair: pair[1].share, default=None)
 
     @property
     def energy_j(self) -> tuple[float, float, float]:
@@ -265,8 +265,8 @@ def _degrees(value: float, form: str = ".1f") -> str:
 
 def _share(name: str) -> Callable[[JointDemand], str]:
     def cell(joint: JointDemand) -> str:
-        (found,) = (demand for demand in joint.demands if demand.name == name)
-        return _number(100.0 * found.share, ".0f")
+        (match,) = (demand for demand in joint.demands if demand.name == name)
+        return _number(100.0 * match.share, ".0f")
 
     return cell
 
@@ -363,10 +363,10 @@ def _answer(run: DryRun) -> Iterator[str]:
 
 def _nearest(run: DryRun) -> str:
     """What comes closest to its limit."""
-    found = run.closest
-    if found is None:
+    closest = run.closest
+    if closest is None:
         return "it has no limits to come close to"
-    joint, demand = found
+    joint, demand = closest
     unit, scale = _SHOWN_AS[demand.name]
     return (
         f"closest to a limit: {joint}, {demand.name} {scale * demand.value:.3g} of "
@@ -384,10 +384,10 @@ def _clamps(run: DryRun) -> str:
 
 def _remarks(run: DryRun) -> Iterator[str]:
     """What the gate would change, and why."""
-    found = [remark.text for remark in run.remarks if remark.level == "warn"]
-    yield from (f"  {text}" for text in found[:_REMARKS])
-    if len(found) > _REMARKS:
-        yield f"  and {len(found) - _REMARKS} more of this kind; --json has all"
+    texts = [remark.text for remark in run.remarks if remark.level == "warn"]
+    yield from (f"  {text}" for text in texts[:_REMARKS])
+    if len(texts) > _REMARKS:
+        yield f"  and {len(texts) - _REMARKS} more of this kind; --json has all"
 
 
 def _approach(run: DryRun) -> str:
@@ -409,7 +409,7 @@ def reported(run: DryRun) -> dict[str, Any]:
     Returns:
         SI units; what isn't known, or has no limit, is None.
     """
-    found = run.closest
+    closest = run.closest
     net, absolute, electrical = run.energy_j
     seconds = max(run.duration_s, 1e-9)
     return {
@@ -424,7 +424,7 @@ def reported(run: DryRun) -> dict[str, Any]:
         "planned_duration_s": run.scenario.duration_s,
         "stop": _stop(run),
         "missing_limits": list(run.missing),
-        "closest": None if found is None else {"joint": found[0], **_demand(found[1])},
+        "closest": None if closest is None else {"joint": closest[0], **_demand(closest[1])},
         "first_pose": list(run.first_pose),
         "approach_s": _known(run.approach_s),
         "energy_net_j": net,

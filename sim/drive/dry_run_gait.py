@@ -128,7 +128,7 @@ class DemandTally:
         count = len(robot.joints)
         self._robot, self._limits = robot, limits
         self._ticks = 0
-        self._wanted: list[FloatArray] = []  # the last two, for rates and accelerations
+        self._past: list[FloatArray] = []  # the last two, for rates and accelerations
         self._least = np.full(count, np.inf)
         self._greatest = np.full(count, -np.inf)
         self._rate, self._acceleration, self._clamped = np.zeros((3, count))
@@ -137,21 +137,21 @@ class DemandTally:
         self._energy = self._energy_before = np.zeros((len(JOINT_TERMS), count))
         self._begun = False
 
-    def command(self, wanted: FloatArray, clamped: BoolArray) -> None:
+    def command(self, angles: FloatArray, clamped: BoolArray) -> None:
         """Add the commands of one tick; before the first one the joints rest in that pose.
 
         Args:
-            wanted: Commands of the gait [rad], shape (m,).
+            angles: Commands of the gait [rad], shape (m,).
             clamped: Whether the gate changes it, shape (m,).
         """
-        past = self._wanted or [wanted, wanted]
+        past = self._past or [angles, angles]
         newest, older = past[-1], past[0]
-        self._least = np.fmin(self._least, wanted)
-        self._greatest = np.fmax(self._greatest, wanted)
-        self._rate = np.fmax(self._rate, CONTROL_RATE_HZ * np.abs(wanted - newest))
-        bend = CONTROL_RATE_HZ**2 * np.abs(wanted - 2.0 * newest + older)
+        self._least = np.fmin(self._least, angles)
+        self._greatest = np.fmax(self._greatest, angles)
+        self._rate = np.fmax(self._rate, CONTROL_RATE_HZ * np.abs(angles - newest))
+        bend = CONTROL_RATE_HZ**2 * np.abs(angles - 2.0 * newest + older)
         self._acceleration = np.fmax(self._acceleration, bend)
-        self._wanted = [newest, wanted]
+        self._past = [newest, angles]
         self._clamped += clamped
         self._ticks += 1
 
@@ -305,9 +305,9 @@ class GatedGait:
             self.tally.receive(self.twin.sensed)
         if step.command is not None:
             self._command = step.command
-        if step.gait is None or step.wanted is None:
+        if step.gait is None or step.requested is None:
             return GaitTick(self._command.copy(), self._values, str(step.phase), ())
-        self.tally.command(step.wanted, ~(np.abs(self._command - step.wanted) <= _CHANGED))
+        self.tally.command(step.requested, ~(np.abs(self._command - step.requested) <= _CHANGED))
         self._values = step.gait.values
         return step.gait._replace(command=self._command.copy())
 

@@ -98,13 +98,13 @@ class BusCheck:
         """
         bus, messages = bus_messages(robot)
         self._robot_name = robot.name
-        self._known = _sorted({frame_id(message) for message in messages.values()})
+        self._identifiers = _sorted({frame_id(message) for message in messages.values()})
         reported = {s.message for s in bus.signals if s.direction is Direction.RX}
         commanded = {s.message for s in bus.signals if s.direction is Direction.TX}
         replies = {frame_id(messages[name]) for name in reported}
         # Where a request and its reply share an identifier, hearing it tells nothing.
         self._commands = _sorted({frame_id(messages[name]) for name in commanded} - replies)
-        self.known = 0
+        self.recognised = 0
         self.strange: Counter[int] = Counter()
 
     def add(self, frames: FrameArray) -> GateFault | None:
@@ -124,10 +124,10 @@ class BusCheck:
             )
         data = ids[~errors & ((ids & REMOTE_FLAG) == 0) & (frames["dir"] == DIR_RX)]
         data = data.astype(np.int64)
-        known = np.isin(data, self._known)
-        self.known += int(known.sum())
-        if not known.all():
-            self.strange.update(data[~known].tolist())
+        recognised = np.isin(data, self._identifiers)
+        self.recognised += int(recognised.sum())
+        if not recognised.all():
+            self.strange.update(data[~recognised].tolist())
         others = data[np.isin(data, self._commands)]
         if not len(others):
             return None
@@ -139,15 +139,15 @@ class BusCheck:
 
     def another_robot(self) -> str | None:
         """Return why the bus is that of another robot; None if it may be the right one."""
-        if self.strange.total() <= self.known:
+        if self.strange.total() <= self.recognised:
             return None
         listed = ", ".join(
             identifier_text(identifier)
             for identifier, _ in self.strange.most_common(_IDENTIFIERS_SHOWN)
         )
         return (
-            f"another robot is on this bus: of {self.strange.total() + self.known} frames received "
-            f"{self.known} are of {self._robot_name}; others have the identifiers {listed}"
+            f"another robot is on this bus: of {self.strange.total() + self.recognised} frames "
+            f"received {self.recognised} are of {self._robot_name}; others have the identifiers {listed}"
         )
 
 
@@ -236,11 +236,11 @@ class CurrentLimiter:
         """Joints that give way, shape (m,)."""
         return self._share < 1.0
 
-    def apply(self, wanted: FloatArray, angle: FloatArray, current: FloatArray) -> FloatArray:
+    def apply(self, requested: FloatArray, angle: FloatArray, current: FloatArray) -> FloatArray:
         """Pull commands towards the measured angles where currents exceed their limits.
 
         Args:
-            wanted: Joint angles [rad], shape (m,).
+            requested: Joint angles [rad], shape (m,).
             angle: Measured angles [rad], NaN where unknown, shape (m,).
             current: Measured currents [A], NaN where unknown, shape (m,).
 
@@ -251,8 +251,8 @@ class CurrentLimiter:
         self._share = np.where(beyond, self._share * _LESS, np.minimum(self._share + _MORE, 1.0))
         pulls = self.yields & np.isfinite(angle)
         pulled = np.where(pulls, angle, 0.0)
-        pulled += self._share * (wanted - pulled)
-        return np.where(pulls, pulled, wanted)
+        pulled += self._share * (requested - pulled)
+        return np.where(pulls, pulled, requested)
 
 
 class Watch:
@@ -275,14 +275,14 @@ class Watch:
             The fault, None if all is well.
         """
         of, error = self._limits, np.abs(status.angle - command)
-        found = (
+        faults = (
             self._lost(time_s, status.silence_s),
             self._excess(time_s, FaultKind.CURRENT, "A", np.abs(status.current), of.current),
             self._excess(time_s, FaultKind.TEMPERATURE, "degC", status.temperature, of.temperature),
             self._excess(time_s, FaultKind.VOLTAGE, "V", status.voltage, of.voltage),
             self._excess(time_s, FaultKind.TRACKING, "rad", error, of.tracking_error),
         )
-        return next((fault for fault in found if fault is not None), None)
+        return next((fault for fault in faults if fault is not None), None)
 
     def _lost(self, time_s: float, silence_s: FloatArray) -> GateFault | None:
         limit_s = self._limits.reply_timeout_s
@@ -329,8 +329,8 @@ def _named(names: tuple[str, ...], chosen: BoolArray) -> str:
     """Return the chosen names as the subject of a sentence."""
     if chosen.all():
         return "the robot is"
-    found = list(compress(names, chosen))
-    return some_names(found, _SHOWN) + (" is" if len(found) == 1 else " are")
+    listed = list(compress(names, chosen))
+    return some_names(listed, _SHOWN) + (" is" if len(listed) == 1 else " are")
 
 
 @dataclass
@@ -400,15 +400,15 @@ class Confirmation:
         if not replies.any():
             return
         self._quiet, self._silent, self._wait, self._received = 0, 0, self._patience, True
-        for joint, (own, count) in enumerate(zip(self._open, replies.tolist(), strict=True)):
-            if count > len(own):
-                self._given_up[joint] -= count - len(own)  # they came after all
+        for joint, (rounds, count) in enumerate(zip(self._open, replies.tolist(), strict=True)):
+            if count > len(rounds):
+                self._given_up[joint] -= count - len(rounds)  # they came after all
                 self.by_replies = self.by_replies and self._given_up[joint] >= 0
-            for _ in range(min(count, len(own))):
-                self._answered = max(self._answered, own.popleft())
-        for joint, own in enumerate(self._open):  # the bus had them before two that it answered
-            while own and own[0] <= self._answered - 2:
-                own.popleft()
+            for _ in range(min(count, len(rounds))):
+                self._answered = max(self._answered, rounds.popleft())
+        for joint, rounds in enumerate(self._open):  # the bus had them before two that it answered
+            while rounds and rounds[0] <= self._answered - 2:
+                rounds.popleft()
                 self._given_up[joint] += 1
         for sent in self._sent:
             if sent.confirmed_ns is None and sent.round < self._answered:
@@ -421,9 +421,9 @@ class Confirmation:
             if lag and self._quiet < min((lag + 1) * self._limit, self._longest):
                 return False
             if lag:
-                for joint, own in enumerate(self._open):
-                    self._given_up[joint] += len(own)
-                    own.clear()
+                for joint, rounds in enumerate(self._open):
+                    self._given_up[joint] += len(rounds)
+                    rounds.clear()
             self._answered, lag, self.pausing = self._round, 0, False
             self._lags.clear()
         if lag >= self._most:
@@ -440,8 +440,8 @@ class Confirmation:
             return False
         self._round += 1
         self._quiet, self._received = 0, False
-        for own in self._open:
-            own.append(self._round)
+        for rounds in self._open:
+            rounds.append(self._round)
         return True
 
     def send(self, command: FloatArray, pose: FloatArray) -> None:

@@ -142,13 +142,13 @@ class Gate:
         self._follow(tick, inputs, clamp, stop, at_once=at_once)
         if self.phase in {GatePhase.DONE, GatePhase.HOLD}:
             return self._quiet()
-        wanted, gait = self._wanted(tick, inputs, clamp)
-        pulled = self._yielding.apply(wanted, inputs.status.angle, inputs.status.current)
+        requested, gait = self._requested(tick, inputs, clamp)
+        pulled = self._yielding.apply(requested, inputs.status.angle, inputs.status.current)
         given = clamp.apply(pulled, inputs.bounds)
         self._log_changes(given)
         phase = self.phase
         self._end_in_time()
-        return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
+        return GateStep(phase, given.command, requested, gait, tuple(self._remarks))
 
     def report(self, fault: GateFault) -> None:
         """Something beside the robot went wrong: the next step begins the ending."""
@@ -205,7 +205,7 @@ class Gate:
 
     # -- what is wanted --------------------------------------------------------------------
 
-    def _wanted(
+    def _requested(
         self, tick: int, inputs: GateInput, clamp: Clamp
     ) -> tuple[FloatArray, GaitTick | None]:
         """Return the requested command of the phase, before limits."""
@@ -250,20 +250,20 @@ class Gate:
         self, tick: int, inputs: GateInput, clamp: Clamp, stop: str, *, at_once: bool
     ) -> None:
         """Change the phase on a fault or a stop request."""
-        found = self._trouble(tick, inputs, clamp)
-        if self.phase is GatePhase.HOLD and (found is None or found.kind not in MUTE):
+        fault = self._trouble(tick, inputs, clamp)
+        if self.phase is GatePhase.HOLD and (fault is None or fault.kind not in MUTE):
             self._go_on_holding(clamp, inputs.status, at_once=at_once)
             return
         ending = self.phase is GatePhase.ENDING or self.silence.silent
-        if found is not None and (not ending or found.kind in MUTE):
-            self._fail(found, clamp, inputs.status)
+        if fault is not None and (not ending or fault.kind in MUTE):
+            self._fail(fault, clamp, inputs.status)
             return
         if self.silence.silent:
             self._fail(self._silent(tick), clamp, inputs.status)
             return
-        if found is not None and f"{found.kind} {found.joint}" not in self._logged:
-            self._logged.add(f"{found.kind} {found.joint}")
-            self._remark("error", f"fault while ending: {found.text}")
+        if fault is not None and f"{fault.kind} {fault.joint}" not in self._logged:
+            self._logged.add(f"{fault.kind} {fault.joint}")
+            self._remark("error", f"fault while ending: {fault.text}")
         if at_once:
             self._halt(f"{stop}, twice")
         elif stop and self.phase is not GatePhase.ENDING:

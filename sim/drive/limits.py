@@ -128,16 +128,16 @@ class GateLimits:
 
     def facts(self) -> dict[str, str]:
         """For a session's metadata: each limit, as one number where all joints have the same."""
-        found: dict[str, str] = {}
+        texts: dict[str, str] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 numbers: list[float] = value.tolist()
                 same = len({repr(number) for number in numbers}) == 1
-                found[field.name] = repr(numbers[0]) if same else json.dumps(numbers)
+                texts[field.name] = repr(numbers[0]) if same else json.dumps(numbers)
             elif field.name != "joint_names":
-                found[field.name] = str(value)
-        return found
+                texts[field.name] = str(value)
+        return texts
 
 
 def gate_limits(robot: Robot) -> GateLimits:
@@ -281,12 +281,12 @@ class Clamp:
         self.cuts: dict[str, int] = dict.fromkeys(Clamped._fields[1:], 0)
 
     def apply(
-        self, wanted: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
+        self, requested: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
     ) -> Clamped:
         """Make a command fit to be sent; it counts as sent.
 
         Args:
-            wanted: Joint angles [rad], shape (m,); anything.
+            requested: Joint angles [rad], shape (m,); anything.
             bounds: Least and greatest angles that the commands on their way leave [rad], shapes
                 (m,), the last command among them; None: all.
 
@@ -294,21 +294,21 @@ class Clamp:
             The command, and what was changed.
         """
         limits = self._limits
-        finite = np.isfinite(wanted)
-        within = np.clip(np.where(finite, wanted, self.last), limits.lower, limits.upper)
+        finite = np.isfinite(requested)
+        within = np.clip(np.where(finite, requested, self.last), limits.lower, limits.upper)
         stepped = np.clip(within, self.last - self._reach, self.last + self._reach)
         command = stepped
         if bounds is not None:  # the last command is within, but for rounding
             least, greatest = np.minimum(bounds[0], self.last), np.maximum(bounds[1], self.last)
             command = np.clip(stepped, least, greatest)
-        by_position = finite & (np.abs(within - wanted) > _ROUNDING)
+        by_position = finite & (np.abs(within - requested) > _ROUNDING)
         by_rate = np.abs(stepped - within) > _ROUNDING
         unconfirmed = np.abs(command - stepped) > _ROUNDING
         self.last = command
-        found = Clamped(command.copy(), by_position, by_rate, unconfirmed, ~finite)
-        for why, joints in zip(self.cuts, found[1:], strict=True):
+        outcome = Clamped(command.copy(), by_position, by_rate, unconfirmed, ~finite)
+        for why, joints in zip(self.cuts, outcome[1:], strict=True):
             self.cuts[why] += int(joints.sum())
-        return found
+        return outcome
 
 
 class Ramp:

@@ -156,10 +156,10 @@ class BusReadings:
         """Keep the values that are known; of several of one target the last one stays."""
         quantity, axis = decoded.signals[0].quantity, decoded.signals[0].axis
         if quantity in self._joint_values:
-            own = np.array([self._joints[signal.target] for signal in decoded.signals])
-            known = np.isfinite(decoded.values)  # no servo is at infinity
-            joints = own[decoded.member[known]]
-            self._joint_values[quantity][joints] = decoded.values[known]
+            targets = np.array([self._joints[signal.target] for signal in decoded.signals])
+            finite = np.isfinite(decoded.values)  # no servo is at infinity
+            joints = targets[decoded.member[finite]]
+            self._joint_values[quantity][joints] = decoded.values[finite]
             self._joint_times[quantity][joints] = time_s
             if quantity is Quantity.POSITION:
                 np.add.at(self.angles, joints, 1)
@@ -175,10 +175,10 @@ class BusReadings:
                 beyond = value > self._range_max[target]
                 self._ranges[target] = time_s, math.inf if beyond else value
             elif quantity in _VECTORS:
-                known = self._vectors[quantity]
-                vector = known[target][1].copy() if target in known else np.full(3, np.nan)
+                vectors = self._vectors[quantity]
+                vector = vectors[target][1].copy() if target in vectors else np.full(3, np.nan)
                 vector[_AXES.index(axis)] = value
-                known[target] = time_s, frozen(vector)
+                vectors[target] = time_s, frozen(vector)
 
 
 def _with_gait_signals(robot: Robot) -> Robot:
@@ -252,15 +252,17 @@ def find_virtual_robot(address: SourceAddress, tally: Tally) -> VirtualRobotLink
     except OSError as error:
         raise SourceError(address.text, f"can't connect: {error.strerror or error}") from error
     try:
-        found, rest = _identity(sock, rest)
-        if found is None:
+        identity, rest = _identity(sock, rest)
+        if identity is None:
             sock.close()
             return None
         rest = enter_raw_mode(sock, rest, channel)
     except OSError as error:
         sock.close()
         raise SourceError(address.text, f"can't open it: {error.strerror or error}") from error
-    return VirtualRobotLink(address.text, sock, rest, tally, found[1], lockstep=found[2] != "paced")
+    return VirtualRobotLink(
+        address.text, sock, rest, tally, identity[1], lockstep=identity[2] != "paced"
+    )
 
 
 def _identity(sock: socket.socket, rest: bytes) -> tuple[re.Match[str] | None, bytes]:
@@ -313,8 +315,8 @@ class VirtualRobotLink:
         """Return the received frames, without waiting; tick marks are skipped."""
         while select.select([self._socket], [], [], 0.0)[0]:
             self._read()
-        found, self._ready, self._ticks = self._ready, [], []
-        return found
+        frames, self._ready, self._ticks = self._ready, [], []
+        return frames
 
     def wait_tick(self, timeout_s: float) -> tuple[int, Sequence[FrameArray]] | None:
         """Wait for the robot's next control tick.

@@ -127,12 +127,12 @@ class LockstepPace:
         Raises:
             SourceError: If the robot is gone, or does not come to it.
         """
-        found = self._link.wait_tick(LOST_S)
-        if found is None:
+        received = self._link.wait_tick(LOST_S)
+        if received is None:
             raise SourceError(
                 self._link.place, f"the robot is lost: no control tick for {LOST_S:g} s"
             )
-        tick, frames = found
+        tick, frames = received
         if self._first is None:
             self._first = tick
         return tick - self._first, frames
@@ -246,7 +246,7 @@ class ControlLoop:
         """
         self.tally = LoopTally()
         self._gate, self._link, self._pace, self._spacing = gate, link, pace, spacing
-        self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
+        self._encoder, self._readings = CommandEncoder(robot), BusReadings(robot)
         self._presence = BusCheck(robot)
         self._polls = poll_frames(robot)
         self._confirmation = confirmation if len(self._polls) else None
@@ -310,22 +310,22 @@ class ControlLoop:
             raise failed
 
     def _receive(self, tick: int, received: Sequence[FrameArray]) -> GateInput:
-        time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
+        time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._readings.angles.copy()
         for frames in received:
-            self._known.add(frames, time_s)
+            self._readings.add(frames, time_s)
             trouble = trouble or self._presence.add(frames)
             self.tally.received += len(frames)
-        self.tally.decoded = self._known.tally.decoded
+        self.tally.decoded = self._readings.tally.decoded
         if self._pace.by_the_clock:
             self.tally.late_s.append(self._pace.late_s)
-        fresh, bounds = self._known.angles - before, None
+        fresh, bounds = self._readings.angles - before, None
         if self._confirmation is not None:
             last_ns = max((int(frames["t_host_ns"][-1]) for frames in received), default=0)
             self._confirmation.receive(fresh, last_ns)
             bounds = self._confirmation.bounds()
         return GateInput(
-            readings=self._known.readings(time_s),
-            status=self._known.status(time_s),
+            readings=self._readings.readings(time_s),
+            status=self._readings.status(time_s),
             trouble=trouble,
             another_robot=self._presence.another_robot(),
             late_s=self._pace.late_s,

@@ -53,7 +53,7 @@ class MotionSource:
             one that it was made for.
         facts: What a session's metadata says of it.
         attachments: File name to TOML text that explains it.
-        own: The scenario whose gait and controller are driven, if that is what it is: a run's
+        origin: The scenario whose gait and controller are driven, if that is what it is: a run's
             scenario then says it all.
         settle_s: The first part of it that is not fit for steady-state analysis, None where it
             does not say.
@@ -74,7 +74,7 @@ class MotionSource:
     make: Callable[[Robot, Scenario | None], Gait]
     facts: Mapping[str, str]
     attachments: Mapping[str, bytes]
-    own: Scenario | None = None
+    origin: Scenario | None = None
     settle_s: float | None = None
     records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     kernels: Kernels = Kernels.NUMPY
@@ -132,8 +132,10 @@ class MotionSource:
         if world is not None or not self.as_run:
             turned = where.world.turned(self.heading_rad) if self.heading_rad else where.world
             where = dataclasses.replace(where, world=turned, seed=where.seed + self.run)
-        if self.own is not None:
-            where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
+        if self.origin is not None:
+            where = dataclasses.replace(
+                where, gait=self.origin.gait, controller=self.origin.controller
+            )
         if self.settle_s is not None:
             where = dataclasses.replace(where, settle_s=self.settle_s)
         return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
@@ -168,9 +170,9 @@ def find_motion(
     is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
     if path.suffix == ".mcap" or is_folder:
         return _commands(path, world, changes, robot, command_topic)
-    found = Shelf("gait or plan", "undulog.sim", "scenarios", PlanError).read(word)
-    if is_plan(found.text):
-        return _plan(found.text, found.source)
+    document = Shelf("gait or plan", "undulog.sim", "scenarios", PlanError).read(word)
+    if is_plan(document.text):
+        return _plan(document.text, document.source)
     return _gait(load_scenario(word))
 
 
@@ -188,7 +190,7 @@ def _gait(scenario: Scenario) -> MotionSource:
         make=make,
         facts={"driven": "gait", "driven.by": scenario.name},
         attachments={"gait.toml": scenario.toml().encode()},
-        own=scenario,
+        origin=scenario,
         settle_s=scenario.settle_s,
     )
 

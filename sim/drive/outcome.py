@@ -218,13 +218,13 @@ class GateStep(NamedTuple):
     Attributes:
         phase: State of the gate.
         command: What to send, joint angles [rad], shape (m,); None: nothing.
-        wanted: What that was made from, before the gate changed anything; None likewise.
+        requested: What that was made from, before the gate changed anything; None likewise.
         gait: The gait's tick, while it runs.
         remarks: Events to be logged.
     """
 
     phase: GatePhase
     command: FloatArray | None
-    wanted: FloatArray | None
+    requested: FloatArray | None
     gait: GaitTick | None
     remarks: tuple[GateEvent, ...]

@@ -200,8 +200,8 @@ def parse_plan(text: str, source: Path) -> Plan:
     start, ramp_s = _start(top, scenario)
     segments = _segments(top, start)
     top.close()
-    if (found := faults.all()) or scenario is None:
-        raise PlanError(source, found)
+    if (problems := faults.all()) or scenario is None:
+        raise PlanError(source, problems)
     return Plan(name, description, scenario, start, ramp_s, segments)
 
 

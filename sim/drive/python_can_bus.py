@@ -108,10 +108,10 @@ class PythonCanBus:
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting; CAN FD frames carry nothing of a bus map."""
         try:
-            found = self._link.read(self._now_ns())
+            received = self._link.read(self._now_ns())
         except OSError as error:
             raise self._lost(error) from error
-        return [frames for frames in found if len(frames) and not holds_fd(frames)]
+        return [frames for frames in received if len(frames) and not holds_fd(frames)]
 
     def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
         """Put frames on the bus, one after the other."""
@@ -160,7 +160,7 @@ def open_link(address: SourceAddress, tally: Tally) -> VirtualRobotLink | Python
     if not channel:
         raise UsageError(f"{address.text!r}: no channel; expected can:socketcand:CHANNEL")
     plain = flag(address, "plain", default=False)
-    own = {key: value for key, value in address.options.items() if key != "plain"}
-    address = dataclasses.replace(address, options=own)
+    options = {key: value for key, value in address.options.items() if key != "plain"}
+    address = dataclasses.replace(address, options=options)
     virtual = None if plain else find_virtual_robot(address, tally)
     return virtual or PythonCanBus(address, tally)

@@ -29,13 +29,13 @@ REPLAY = "replay"
 
 
 class _Held:
-    """Values of several names, each by zero-order hold; NaN is a value unless ``known`` only."""
+    """Values of several names, each by zero-order hold; NaN is a value unless ``finite_only``."""
 
-    def __init__(self, signals: JointSignals, *, known: bool = False) -> None:
+    def __init__(self, signals: JointSignals, *, finite_only: bool = False) -> None:
         self.names = signals.names
         self._series: list[tuple[IntArray, FloatArray]] = []
         for t_ns, values in zip(signals.t_ns, signals.values, strict=True):
-            kept = ~np.isnan(values) if known else slice(None)
+            kept = ~np.isnan(values) if finite_only else slice(None)
             self._series.append((t_ns[kept], values[kept]))
 
     @property
@@ -50,12 +50,12 @@ class _Held:
 
     def at(self, t_ns: int) -> FloatArray:
         """The values in force at a time; NaN of what has none."""
-        found = np.full(len(self._series), np.nan)
+        result = np.full(len(self._series), np.nan)
         for i, (times, values) in enumerate(self._series):
             if len(times):
                 k = int(np.searchsorted(times, t_ns, side="right")) - 1
-                found[i] = values[max(k, 0)]
-        return found
+                result[i] = values[max(k, 0)]
+        return result
 
     def means(self, edges_ns: IntArray) -> FloatArray:
         """Time means of the values in force; NaN of what has none.
@@ -130,7 +130,7 @@ class CommandReplay:
             JointSetError: If the robot lacks one of the joints.
             DataError: If there is no command.
         """
-        held = _Held(recorded.commands, known=True)
+        held = _Held(recorded.commands, finite_only=True)
         strange = [name for name in held.names if name not in robot.joint_names]
         if strange:
             raise JointSetError(
@@ -159,9 +159,9 @@ class CommandReplay:
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - recorded
         """Return the commands in force at a time."""
         t_ns = self._start_ns + round(time_s * NS)
-        wanted = self._of_robot(self._commands.at(t_ns))
-        command = np.clip(wanted, self._lower, self._upper)
-        cut = np.flatnonzero(command != wanted)
+        recorded = self._of_robot(self._commands.at(t_ns))
+        command = np.clip(recorded, self._lower, self._upper)
+        cut = np.flatnonzero(command != recorded)
         clamped = tuple(self._joint_names[i] for i in cut)
         values = self._gait.at(t_ns) if self._gait is not None else np.empty(0)
         return GaitTick(command, values, self._modes[bisect_right(self._since_ns, t_ns)], clamped)

@@ -167,7 +167,7 @@ class BusSession:
         self.writer.explain(driven.attachments, driven.records)
         names = robot.joint_names
         self._commands = self.writer.joint_state("/joint_commands", names, unit="rad")
-        self._wanted = self.writer.joint_state("/gate/wanted", names, unit="rad")
+        self._requested = self.writer.joint_state("/gate/wanted", names, unit="rad")
         self._gait = (
             self.writer.joint_state("/gait", gait_names, unit=GAIT_UNIT) if gait_names else None
         )
@@ -185,10 +185,10 @@ class BusSession:
     @property
     def shortage(self) -> str | None:
         """Why it can't go on for long: its disk, and what is missing; None while it can."""
-        found = self._sink.shortage
-        if found is None:
+        shortage = self._sink.shortage
+        if shortage is None:
             return self._sink.misplaced or None
-        return f"the disk at {_mount_of(found.path)} is full or fails: {found}"
+        return f"the disk at {_mount_of(shortage.path)} is full or fails: {shortage}"
 
     def write(self, tick: BusTick, t_ns: int) -> None:
         """Write one tick.
@@ -216,8 +216,8 @@ class BusSession:
             self._events.write(t_ns, level, _EVENTS_OF, text)
         if step.command is not None:
             self._commands.write(t_ns, step.command)
-        if step.wanted is not None:
-            self._wanted.write(t_ns, step.wanted)
+        if step.requested is not None:
+            self._requested.write(t_ns, step.requested)
         if step.gait is not None:
             self._write_gait(step.gait, t_ns)
 

@@ -166,7 +166,7 @@ class _DelayRhythm:
         omega = self._omega * change.frequency_factor
         self._history.advance(time_s, omega)
         then = time_s - self._delays
-        ramp = np.array([started(one, self._ramp_s) for one in then.tolist()])
+        ramp = np.array([started(instant, self._ramp_s) for instant in then.tolist()])
         return WaveState(
             amplitude=ramp * line.amplitude * change.amplitude_factor,
             offset=ramp * line.offset + change.offset,

@@ -394,10 +394,10 @@ class _OscillatorRhythm:
 
     def _feel(self, angle: FloatArray, offset: FloatArray) -> None:
         """Take the servos' reports; joints without one are left out."""
-        known = np.isfinite(angle)
+        finite = np.isfinite(angle)
         eps = self._chain.feedback
-        self._felt = eps * 2.0 * np.where(known, angle - offset, 0.0) / self._chain.amplitude
-        self._steady = np.where(known, eps * self._bias, 0.0)
+        self._felt = eps * 2.0 * np.where(finite, angle - offset, 0.0) / self._chain.amplitude
+        self._steady = np.where(finite, eps * self._bias, 0.0)
 
     def _kick(self, time_s: float) -> None:
         """Make the kick whose time has come; at most one a control period."""

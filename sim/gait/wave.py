@@ -199,9 +199,9 @@ class _PlanePart:
         # Rounding of offset + amplitude may pass the limit in the last digit.
         return np.minimum(np.maximum(angle, self.lower), self.upper), amplitude, offset
 
-    def cut(self, key: str, wanted: FloatArray, given: FloatArray) -> list[str]:
+    def cut(self, key: str, requested: FloatArray, given: FloatArray) -> list[str]:
         """Names of a value that was cut: that of the plane, or those of the joints concerned."""
-        differs: BoolArray = wanted != given
+        differs: BoolArray = requested != given
         if differs.all():
             return [f"{self.plane}.{key}"]
         return [f"{self.names[i]}.{key}" for i in np.flatnonzero(differs)]

@@ -391,11 +391,11 @@ def kinetic_energy(
 
 def ground_table(ground: Ground | None) -> FloatArray:
     """Return k, d, mu_t, mu_n, eps, c_t and c_n, shape (7,); all forces 0 without ground."""
-    one = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
+    surface = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
     return np.array(
         [
-            *(one.stiffness, one.damping, one.mu_tangential, one.mu_normal),
-            *(one.slip_speed, one.drag_tangential, one.drag_normal),
+            *(surface.stiffness, surface.damping, surface.mu_tangential, surface.mu_normal),
+            *(surface.slip_speed, surface.drag_tangential, surface.drag_normal),
         ]
     )
 

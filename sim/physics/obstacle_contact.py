@@ -119,8 +119,8 @@ class ObstacleLaw:
             position: Centres of the links [m], shape (3, n).
             way: How far they move from there, at most [m].
         """
-        found = [shape.reachable(position[:2, None, :], way) for shape in self.shapes]
-        return replace(self, shapes=[shape for shape in found if shape is not None])
+        shapes = [shape.reachable(position[:2, None, :], way) for shape in self.shapes]
+        return replace(self, shapes=[shape for shape in shapes if shape is not None])
 
     def __call__(
         self, position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
@@ -133,18 +133,18 @@ class ObstacleLaw:
             velocity: Velocities of the centres [m/s], shape (3, n).
             spin: Angular velocities in the world [rad/s], shape (3, n).
         """
-        found = [
+        touches = [
             touch
             for shape in self.shapes
             if (touch := self._touching(shape, position, quaternion)) is not None
         ]
-        if not found:
+        if not touches:
             return NO_CONTACT
         material = self.material
-        link = np.concatenate([touch.link for touch in found])
-        axis = np.concatenate([touch.axis for touch in found], axis=1)
-        normal = np.concatenate([touch.normal for touch in found], axis=1)
-        depth = np.concatenate([touch.depth for touch in found])
+        link = np.concatenate([touch.link for touch in touches])
+        axis = np.concatenate([touch.axis for touch in touches], axis=1)
+        normal = np.concatenate([touch.normal for touch in touches], axis=1)
+        depth = np.concatenate([touch.depth for touch in touches])
         arm = axis - self.radius[link] * normal
         at_point = velocity[:, link] + cross(spin[:, link], arm)
         speed = (normal * at_point).sum(axis=0)
@@ -164,17 +164,17 @@ class ObstacleLaw:
         if not len(link):
             return None
         half = self.length[link] / 2 * _forward(quaternion[:, link])
-        pair, found = shape.closest(which, position[:2, link], half[:2], self.radius[link])
+        pair, closest = shape.closest(which, position[:2, link], half[:2], self.radius[link])
         if not len(pair):
             return None
-        which, link, axis = which[pair], link[pair], found.s * half[:, pair]
-        depth = self.radius[link] - found.distance
+        which, link, axis = which[pair], link[pair], closest.s * half[:, pair]
+        depth = self.radius[link] - closest.distance
         bottom = position[2, link] + axis[2] - self.radius[link]
         touch = (depth > 0.0) & (bottom < shape.height[which])
         if not touch.any():
             return None
         normal = np.zeros((3, int(touch.sum())))
-        normal[:2] = found.normal[:, touch]
+        normal[:2] = closest.normal[:, touch]
         return _Touch(link[touch], axis[:, touch], normal, depth[touch])
 
 

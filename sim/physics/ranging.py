@@ -212,8 +212,8 @@ class Ranging(Generic[_Model]):
         distance = self._measured(way.reshape(-1, count).min(axis=1), shortest)
         reported = np.where(distance > longest, np.inf, distance).tolist()
         return [
-            RangeSample(self._names[i], float(k * self._dt), each)
-            for k, i, each in zip(step.tolist(), which.tolist(), reported, strict=True)
+            RangeSample(self._names[i], float(k * self._dt), reading)
+            for k, i, reading in zip(step.tolist(), which.tolist(), reported, strict=True)
         ]
 
     def _rays(self, sensors: Sequence[Sensor]) -> tuple[float, FloatArray]:

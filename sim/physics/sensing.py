@@ -120,15 +120,15 @@ class Schedule:
         Returns:
             Steps and sensors, in order of time, each of shape (p,).
         """
-        found: list[tuple[int, int]] = []
+        measurements: list[tuple[int, int]] = []
         while True:
             turn, sensor = divmod(self._done, len(self._phases))
             step = turn * self._period + self._phases[sensor]
             if step >= stop:
                 break
-            found.append((step, sensor))
+            measurements.append((step, sensor))
             self._done += 1
-        steps, sensors = np.array(found, dtype=np.int64).reshape(-1, 2).T
+        steps, sensors = np.array(measurements, dtype=np.int64).reshape(-1, 2).T
         return steps, sensors
 
 

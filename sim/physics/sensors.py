@@ -382,8 +382,8 @@ class Senses:
         """Take in one control period."""
         start = self._start
         self._start += len(steps) - 1
-        measured = [one for kind in self._kinds for one in kind.observe(steps, start)]
-        measured.sort(key=lambda one: one.time_s)  # stable: in the order of kinds at one time
+        measured = [sample for kind in self._kinds for sample in kind.observe(steps, start)]
+        measured.sort(key=lambda sample: sample.time_s)  # stable: in the order of kinds at one time
         return self._known([*measured, *self._polling.observe(steps)])
 
     def flush(self) -> list[SensorSample]:
@@ -417,12 +417,18 @@ def _kinds(scenario: Scenario) -> list[_Sensors]:
     caster = RayCaster(world.obstacles, ground=world.ground is not None)
 
     build: dict[SensorKind, Callable[[list[Sensor]], _Sensors]] = {
-        SensorKind.IR: lambda own: Infrared(models.ir, own, robot, caster, dt=dt, seed=seed),
-        SensorKind.SONAR: lambda own: Sonar(models.sonar, own, robot, caster, dt=dt, seed=seed),
-        SensorKind.ACCELEROMETER: lambda own: Accelerometer(
-            models.accelerometer, own, robot, world.gravity, dt=dt, seed=seed
+        SensorKind.IR: lambda sensors: Infrared(
+            models.ir, sensors, robot, caster, dt=dt, seed=seed
         ),
-        SensorKind.COMPASS: lambda own: Compass(models.compass, own, robot, dt=dt, seed=seed),
+        SensorKind.SONAR: lambda sensors: Sonar(
+            models.sonar, sensors, robot, caster, dt=dt, seed=seed
+        ),
+        SensorKind.ACCELEROMETER: lambda sensors: Accelerometer(
+            models.accelerometer, sensors, robot, world.gravity, dt=dt, seed=seed
+        ),
+        SensorKind.COMPASS: lambda sensors: Compass(
+            models.compass, sensors, robot, dt=dt, seed=seed
+        ),
     }
     sensors = {kind: [sensor for sensor in robot.sensors if sensor.kind is kind] for kind in build}
     return [build[kind](sensor) for kind, sensor in sensors.items() if sensor]

@@ -103,8 +103,8 @@ class BusFault:
             "from_s": self.from_s or None,
             "for_s": self.for_s if math.isfinite(self.for_s) else None,
         }
-        known = {key: value for key, value in stated.items() if value is not None}
-        return {"kind": str(self.kind), **known}
+        entries = {key: value for key, value in stated.items() if value is not None}
+        return {"kind": str(self.kind), **entries}
 
 
 def read_faults(top: StrictTable, robot: Robot | None) -> tuple[BusFault, ...]:

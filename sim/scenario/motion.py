@@ -99,8 +99,8 @@ def gait_table(parameters: GaitParameters) -> dict[str, Any]:
     del values["planes"]
     kind = next(kind for kind, (gait, _) in _KINDS.items() if isinstance(parameters, gait))
     values = {"kind": kind, **values}
-    for plane, one in parameters.planes.items():
-        part = values[str(plane)] = write(one)
+    for plane, plane_parameters in parameters.planes.items():
+        part = values[str(plane)] = write(plane_parameters)
         if part.get("oscillator") is OscillatorKind.PHASE:
             del part["attraction"]  # which only Hopf oscillators have
     return values
@@ -114,9 +114,11 @@ def _planes(
         if plane not in table:
             continue
         count = None if robot is None else len(robot.joint_indices(plane))
-        own = table.table(plane)
+        plane_table = table.table(plane)
         planes[plane] = (
-            _oscillator_chain(own, count) if part is OscillatorChain else read(own, part)
+            _oscillator_chain(plane_table, count)
+            if part is OscillatorChain
+            else read(plane_table, part)
         )
         if robot is not None and not count:
             table.fault(plane, f"leave it out: {robot.name} has no {plane} joints")
@@ -145,18 +147,20 @@ def _oscillator_chain(part: StrictTable, count: int | None) -> OscillatorChain:
     return chain
 
 
-def _numbers(part: StrictTable, one: Declared, count: int | None) -> Numbers:
+def _numbers(part: StrictTable, declaration: Declared, count: int | None) -> Numbers:
     """One number, or an array of ``count``."""
-    value = part.look(one.key)[1]
+    value = part.look(declaration.key)[1]
     if not isinstance(value, list):
-        return part.number(one.key, *one.bounds, default=one.default)
+        return part.number(declaration.key, *declaration.bounds, default=declaration.default)
     entries = cast("list[object]", value)
     if count is not None and len(entries) != count:
-        part.fault(one.key, f"a number, or an array of {count}", f"an array of {len(entries)}")
-        return one.default
-    each = {f"{part.key(one.key)}[{i}]": entry for i, entry in enumerate(entries)}
-    listed = StrictTable(each, "", part.faults)
-    return tuple(listed.number(name, *one.bounds) for name in each)
+        part.fault(
+            declaration.key, f"a number, or an array of {count}", f"an array of {len(entries)}"
+        )
+        return declaration.default
+    elements = {f"{part.key(declaration.key)}[{i}]": entry for i, entry in enumerate(entries)}
+    listed = StrictTable(elements, "", part.faults)
+    return tuple(listed.number(name, *declaration.bounds) for name in elements)
 
 
 Share: TypeAlias = Annotated[float, at_least(0.0), at_most(1.0)]

@@ -424,10 +424,12 @@ class RandomField:
         for _ in range(self.count):
             radius = random.uniform(*self.radius)
             tries = (self._drawn(random, radius) for _ in range(_TRIES))
-            found = next((one for one in tries if free(one, [*standing, *placed])), None)
-            if found is None:
+            chosen = next(
+                (candidate for candidate in tries if free(candidate, [*standing, *placed])), None
+            )
+            if chosen is None:
                 break
-            placed.append(found)
+            placed.append(chosen)
         return tuple(placed)
 
     def _drawn(self, random: np.random.Generator, radius: float) -> Cylinder:

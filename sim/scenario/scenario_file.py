@@ -129,8 +129,8 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         ScenarioError: If it has faults; lists all of them.
         RobotFileError: If the robot's own file has faults.
     """
-    found = scenario_text(name_or_path)
-    return parse_scenario(found.text, found.source, changes=changes)
+    document = scenario_text(name_or_path)
+    return parse_scenario(document.text, document.source, changes=changes)
 
 
 def scenario_text(name_or_path: str | Path) -> Description:
@@ -203,8 +203,8 @@ def parse_scenario(
             target=parts["world"].target is not None,
         )
     top.close()
-    if (found := faults.all()) or robot is None:
-        raise ScenarioError(source, found)
+    if (problems := faults.all()) or robot is None:
+        raise ScenarioError(source, problems)
     return Scenario(robot=parts["modules"].fitted(robot), **parts)
 
 

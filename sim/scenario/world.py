@@ -186,15 +186,15 @@ class World:
             UsageError: If there is no room for so many.
         """
         tail = -body_length * math.cos(self.heading), -body_length * math.sin(self.heading)
-        found = field.cylinders(
+        cylinders = field.cylinders(
             seed, body=((0.0, 0.0), tail), target=self.target, standing=self.obstacles
         )
-        if len(found) < field.count:
+        if len(cylinders) < field.count:
             raise UsageError(
-                f"the field of obstacles has room for {len(found)} of {field.count}; lower count, "
-                "radius, clear or gap, or raise size"
+                f"the field of obstacles has room for {len(cylinders)} of {field.count}; lower "
+                "count, radius, clear or gap, or raise size"
             )
-        return dataclasses.replace(self, obstacles=(*self.obstacles, *found), field=field)
+        return dataclasses.replace(self, obstacles=(*self.obstacles, *cylinders), field=field)
 
     def redrawn(self, seed: int, body_length: float) -> World:
         """The same world with its field of obstacles, if it has one, drawn again.

@@ -43,7 +43,7 @@ from ..twin.recording import quick_collections
 from ..twin.twin import Twin
 from .pacing import Pacer
 
-_REGISTERS = {one.quantity: one for one in SERVOS["feetech"]["sts3215"]}
+_REGISTERS = {register.quantity: register for register in SERVOS["feetech"]["sts3215"]}
 _MEMORY = 128
 _ID, _MODEL, _TORQUE = 5, 3, 40  # addresses
 _STS3215 = 777
@@ -89,7 +89,7 @@ class ServoChain:
     def answer(self, packet: bytes) -> bytes:
         """Take a packet with a valid checksum; return what the servos send back."""
         servo, instruction, parameters = packet[2], packet[4], packet[5:-1]
-        own = range(1, len(self._memory) + 1)
+        servos = range(1, len(self._memory) + 1)
         if instruction == SYNC_WRITE and len(parameters) > 2:
             size = parameters[1] + 1
             for at in range(2, len(parameters) - size + 1, size):
@@ -99,23 +99,23 @@ class ServoChain:
             return b"".join(
                 self._read(parameter, *parameters[:2])
                 for parameter in parameters[2:]
-                if parameter in own
+                if parameter in servos
             )
         if instruction == ACTION:
-            for one in own if servo == BROADCAST else (servo,):
-                if one in self._staged:
-                    self._write(one, *self._staged.pop(one))
-        elif instruction == READ and servo in own and len(parameters) == 2:
+            for identifier in servos if servo == BROADCAST else (servo,):
+                if identifier in self._staged:
+                    self._write(identifier, *self._staged.pop(identifier))
+        elif instruction == READ and servo in servos and len(parameters) == 2:
             return self._read(servo, *parameters)
         elif instruction in (WRITE, REG_WRITE) and len(parameters) > 1:
-            for one in own if servo == BROADCAST else (servo,):
+            for identifier in servos if servo == BROADCAST else (servo,):
                 if instruction == REG_WRITE:
-                    self._staged[one] = (parameters[0], parameters[1:])
+                    self._staged[identifier] = (parameters[0], parameters[1:])
                 else:
-                    self._write(one, parameters[0], parameters[1:])
+                    self._write(identifier, parameters[0], parameters[1:])
         elif instruction != PING:
             return b""
-        return feetech_packet(servo, 0) if servo in own else b""
+        return feetech_packet(servo, 0) if servo in servos else b""
 
     def _read(self, servo: int, address: int, size: int) -> bytes:
         memory = self._memory[servo - 1]
@@ -152,15 +152,15 @@ class ServoPorts:
         self._splitter = PacketSplitter("feetech")
         self._masters: list[int] = []
         self.received = self.sent = 0
-        for one in self.paths:
-            if os.path.lexists(one) and not one.is_symlink():
-                raise UsageError(f"{one} is there and no link; give another --feetech PATH")
-        for one in self.paths:
+        for link in self.paths:
+            if os.path.lexists(link) and not link.is_symlink():
+                raise UsageError(f"{link} is there and no link; give another --feetech PATH")
+        for link in self.paths:
             master, slave = os.openpty()
             tty.setraw(slave)
             os.set_blocking(master, False)
-            one.unlink(missing_ok=True)
-            one.symlink_to(os.ttyname(slave))
+            link.unlink(missing_ok=True)
+            link.symlink_to(os.ttyname(slave))
             os.close(slave)
             self._masters.append(master)
 

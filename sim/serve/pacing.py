@@ -44,10 +44,10 @@ def listen_on_loopback(host: str, port: int) -> socket.socket:
         UsageError: If the host is not loopback, or nobody can listen there.
     """
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, OverflowError) as error:
         raise UsageError(f"{host}:{port} is no address to serve at: {error}") from error
-    family, _, _, _, address = found[0]
+    family, _, _, _, address = addresses[0]
     if not ipaddress.ip_address(address[0]).is_loopback:
         raise UsageError(
             f"{host} is not this computer's loopback; a virtual robot is served there only, e.g. "

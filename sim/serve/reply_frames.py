@@ -95,7 +95,9 @@ class ReplyEncoder:
             Shape (k,), sorted.
         """
         chosen = [self._targets.get(target, [])] if target else self._targets.values()
-        return np.unique(np.array([each for part in chosen for each in part], dtype=np.int64))
+        return np.unique(
+            np.array([identifier for part in chosen for identifier in part], dtype=np.int64)
+        )
 
     def frames(self, samples: Sequence[SensorSample], clock_ns: Callable[[int], int]) -> FrameArray:
         """Encode samples.
@@ -204,8 +206,8 @@ class FaultLine:
         command = command.copy()
         for fault in acting:
             i = self._joint[fault.joint]
-            known = command[i] if np.isnan(angle[i]) else angle[i]
-            command[i] = self._held.setdefault(fault, float(known))
+            stuck = command[i] if np.isnan(angle[i]) else angle[i]
+            command[i] = self._held.setdefault(fault, float(stuck))
         return command
 
     def samples(self, samples: Sequence[SensorSample], time_s: float) -> list[SensorSample]:

@@ -101,15 +101,15 @@ class CommandLatch:
             if decoded.signals[0].quantity is not Quantity.COMMAND:
                 continue
             joint = np.array([self._index[signal.target] for signal in decoded.signals])
-            own, values = joint[decoded.member], decoded.values
-            known = ~np.isnan(values)
-            own, values = own[known], values[known]
-            commanded[own] = True
+            joints, values = joint[decoded.member], decoded.values
+            finite = ~np.isnan(values)
+            joints, values = joints[finite], values[finite]
+            commanded[joints] = True
             if received:
-                cut = np.clip(values, self._lower[own], self._upper[own])
-                self.cut |= {self._names[i] for i in own[np.abs(cut - values) > _SLACK].tolist()}
-                self._angle[own] = cut  # of several commands the last one stays
-                self._time_ns[own] = frames["t_device_ns"][decoded.rows[known]]
+                cut = np.clip(values, self._lower[joints], self._upper[joints])
+                self.cut |= {self._names[i] for i in joints[np.abs(cut - values) > _SLACK].tolist()}
+                self._angle[joints] = cut  # of several commands the last one stays
+                self._time_ns[joints] = frames["t_device_ns"][decoded.rows[finite]]
         return commanded
 
     def silent(self, now_ns: int, longest_ns: int) -> BoolArray:

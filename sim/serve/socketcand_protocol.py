@@ -102,7 +102,7 @@ class ClientText:
         self._rest = whole[end:]
         if len(self._rest) > _LONGEST:
             raise ValueError(f"{len(self._rest)} bytes without an end of a message")
-        return [found.decode("latin-1").strip() for found in _MESSAGE.findall(whole[:end])]
+        return [message.decode("latin-1").strip() for message in _MESSAGE.findall(whole[:end])]
 
 
 class Sent(NamedTuple):

@@ -115,11 +115,11 @@ class SocketcandServer:
         """The oldest frame that a client sent and nobody has taken; None where there is none."""
         if not self._sent:
             return None
-        found = self._sent.popleft()
+        sent = self._sent.popleft()
         if len(self._sent) == MOST_SENT - 1:
             for client in self._clients.values():
                 self._watch(client)
-        return found
+        return sent
 
     def broadcast(self, frames: FrameArray, but: int | None = None) -> None:
         """Give frames to every client in raw mode.
@@ -205,8 +205,8 @@ class SocketcandServer:
         if not chunk:
             self._lose(client)
         elif len(self._sent) >= MOST_SENT:
-            for each in self._clients.values():
-                self._watch(each)
+            for other in self._clients.values():
+                self._watch(other)
 
     def _receive(self, client: BusClient, message: str) -> None:
         """Act on one message."""
@@ -387,11 +387,11 @@ class VirtualBus:
         Returns:
             The frames, marked as sent by the robot's computer.
         """
-        frames = records(each.record for each in sent)
+        frames = records(frame.record for frame in sent)
         frames["t_device_ns"] = t_ns
         self.received += len(frames)
         start = 0
-        for client, group in itertools.groupby(each.client for each in sent):
+        for client, group in itertools.groupby(frame.client for frame in sent):
             stop = start + len(list(group))
             self._give(frames[start:stop], client)
             start = stop

@@ -170,8 +170,8 @@ class AdaptiveGait:
         self._haste = TailSpeedUp(controller.tail, roles) if controller.tail else None
         parts = (self._steering, self._shrinking, self._haste, course)
         self._parts = [part for part in parts if part is not None]
-        own = (name for part in self._parts for name in part.names)
-        self.names: tuple[str, ...] = (*generator.names, *own)
+        names = (name for part in self._parts for name in part.names)
+        self.names: tuple[str, ...] = (*generator.names, *names)
         self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
         self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
         self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
@@ -214,17 +214,17 @@ class AdaptiveGait:
 
     def _choose_mode(self, time_s: float) -> str:
         """One word for the tick, at least for a while."""
-        wanted = WALK
+        mode = WALK
         if self._steering.avoiding:
-            wanted = AVOID
+            mode = AVOID
         elif self._haste is not None and self._haste.hastening:
-            wanted = HASTEN
+            mode = HASTEN
         elif self._shrinking is not None and self._shrinking.shrinking:
-            wanted = SHRINK
+            mode = SHRINK
         elif abs(self._steering.offset) > _TURNING:
-            wanted = TURN
-        if wanted != self._mode and time_s - self._mode_since_s >= _MODE_HOLD_S:
-            self._mode, self._mode_since_s = wanted, time_s
+            mode = TURN
+        if mode != self._mode and time_s - self._mode_since_s >= _MODE_HOLD_S:
+            self._mode, self._mode_since_s = mode, time_s
         return self._mode
 
 

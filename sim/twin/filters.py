@@ -224,13 +224,13 @@ class SideLatch:
             +1 to turn right, -1 to turn left; the last side on a tie, at first +1.
         """
         gap = 0.0 if left_m == right_m else right_m - left_m  # no inf - inf
-        wanted = math.copysign(1.0, gap)
+        side = math.copysign(1.0, gap)
         if (
             abs(gap) > self._margin_m
-            and wanted != self._side
+            and side != self._side
             and time_s - self._since_s >= self._hold_s
         ):
-            self._side, self._since_s = wanted, time_s
+            self._side, self._since_s = side, time_s
         return self._side
 
 
@@ -309,8 +309,10 @@ class SlipOdometry:
         along = np.column_stack([ahead[0], ahead[1], (ahead * lever).sum(axis=0)])
         across = np.column_stack([left[0], left[1], (left * lever).sum(axis=0)])
         weight = math.sqrt(self._slip_ratio)
-        known = np.concatenate([(ahead * moved).sum(axis=0), weight * (left * moved).sum(axis=0)])
-        motion = np.linalg.lstsq(np.concatenate([along, weight * across]), -known)[0]
+        internal = np.concatenate(
+            [(ahead * moved).sum(axis=0), weight * (left * moved).sum(axis=0)]
+        )
+        motion = np.linalg.lstsq(np.concatenate([along, weight * across]), -internal)[0]
         return np.asarray(motion, dtype=np.float64)
 
     def _from_head(self, joint: FloatArray) -> FloatArray:

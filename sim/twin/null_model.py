@@ -138,8 +138,8 @@ def varied(scenario: Scenario, values: Mapping[str, float], variant: Variant) ->
     modules = Modules(servo, servo_of, link_of)
     ground = scenario.world.ground
     if ground is not None:
-        own = {name: theta[name] for name in GROUND if name in theta}
-        ground = dataclasses.replace(ground, **own)
+        changed = {name: theta[name] for name in GROUND if name in theta}
+        ground = dataclasses.replace(ground, **changed)
     return dataclasses.replace(
         scenario,
         modules=modules,
@@ -209,14 +209,14 @@ def null_model(
     names = list(values)
     driven = driven_joints(scenario)
     variants = list(_variants(names, [scenario.robot.joint_names[j] for j in driven]))
-    found: list[ComplexArray] = []
+    responses: list[ComplexArray] = []
     command = np.zeros(len(driven), dtype=np.complex128)
     for k, variant in enumerate(variants):
         command, y = response(varied(scenario, values, variant), frequency_hz, kernels)
-        found.append(y)
+        responses.append(y)
         if on_run is not None:
             on_run(k + 1, len(variants))
-    runs = iter(found)
+    runs = iter(responses)
     base = next(runs)
     slope, curvature = _derivatives(base, runs, len(names))
     modules = {
@@ -253,9 +253,9 @@ def _variants(names: Sequence[str], joints: Sequence[str]) -> Iterator[Variant]:
     for name in names:
         yield Variant({name: up})
         yield Variant({name: down})
-    for one, other in combinations(names, 2):
+    for first, other in combinations(names, 2):
         for a, b in ((up, up), (down, down), (up, down), (down, up)):
-            yield Variant({one: a, other: b})
+            yield Variant({first: a, other: b})
     for kind in ("stall_torque", "mass"):
         for joint in joints:
             yield Variant({}, (kind, joint, up))
@@ -277,6 +277,6 @@ def _derivatives(
         slope[k] = (up - down) / (2 * STEP)
         curvature[k, k] = (up - 2 * base + down) / STEP**2
     for k, n in combinations(range(count), 2):
-        both, neither, one, other = (next(runs) for _ in range(4))
-        curvature[k, n] = curvature[n, k] = (both + neither - one - other) / (4 * STEP**2)
+        both, neither, first, other = (next(runs) for _ in range(4))
+        curvature[k, n] = curvature[n, k] = (both + neither - first - other) / (4 * STEP**2)
     return slope, curvature

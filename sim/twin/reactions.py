@@ -230,11 +230,11 @@ class Steering:
         law, distance = self._law, seen.nearest
         side = self._latch.step(now.time_s, seen.left, seen.right)
         self.avoiding = distance < law.range_m and law.f0 > 0.0
-        wanted = course
+        offset = course
         if self.avoiding:
             away = bend(distance, side, law.f0, law.k)
-            wanted = away + course * (1.0 - bend(distance, 1.0, 1.0, law.k))
-        self.offset = self._filter.step(now.elapsed_s, wanted)
+            offset = away + course * (1.0 - bend(distance, 1.0, 1.0, law.k))
+        self.offset = self._filter.step(now.elapsed_s, offset)
         self.values = np.array([self.offset, min(distance, law.range_m), side])
         return self.offset
 
@@ -308,7 +308,7 @@ class TailSpeedUp:
         law = self._law
         distance = distances.nearest(self._layout.tail)
         self.hastening = distance < law.range_m
-        wanted = frequency(distance, law.gain, law.k) if self.hastening else 1.0
-        factor = self._filter.step(now.elapsed_s, wanted)
+        target = frequency(distance, law.gain, law.k) if self.hastening else 1.0
+        factor = self._filter.step(now.elapsed_s, target)
         self.values = np.array([factor, min(distance, law.range_m)])
         return factor

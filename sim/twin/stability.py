@@ -202,21 +202,21 @@ def _ground_parts(
     dt, robot, ground = 1.0 / scenario.physics_rate_hz, scenario.robot, scenario.world.ground
     if ground is None:
         return
-    one = np.ones(len(robot.links))
+    unit = np.ones(len(robot.links))
     # The contact points lie r below the centres: roll and pitch move them too.
     radius = np.array([[link.radius] for link in robot.links])
     slip, other = (
-        (shift, radius) if plane is Plane.HORIZONTAL else (radius * turn, one[:, np.newaxis])
+        (shift, radius) if plane is Plane.HORIZONTAL else (radius * turn, unit[:, np.newaxis])
     )
     slip = slip.copy()
     slip[:, [_OTHER]] = other
     way = "normal" if plane is Plane.HORIZONTAL else "tangential"
     mu, drag = (float(getattr(ground, f"{kind}_{way}")) for kind in ("mu", "drag"))
     if plane is Plane.VERTICAL:
-        yield _Part("world.ground.stiffness", dt**2 * ground.stiffness * one, shift)
-        yield _Part("world.ground.damping", 2 * dt * ground.damping * one, shift)
+        yield _Part("world.ground.stiffness", dt**2 * ground.stiffness * unit, shift)
+        yield _Part("world.ground.damping", 2 * dt * ground.damping * unit, shift)
     if ground.law is FrictionLaw.VISCOUS:
-        yield _Part(f"world.ground.drag_{way}", 2 * dt * drag * one, slip)
+        yield _Part(f"world.ground.drag_{way}", 2 * dt * drag * unit, slip)
     else:
         load = np.array([link.mass for link in robot.links]) * max(-scenario.world.gravity[2], 0.0)
         yield _Part("world.ground.slip_speed", 2 * dt * mu * load / ground.slip_speed, slip)
@@ -237,11 +237,11 @@ def _obstacle_parts(
     ends = np.concatenate([shift + half * turn, shift - half * turn])
     give = (ends * np.linalg.solve(mass, ends.T).T).sum(axis=1)  # 1 / mass behind each
     at = int(np.argmax(give))
-    weakest, one = ends[[at]], np.ones(1)
-    yield _Part("world.obstacle_contact.stiffness", dt**2 * material.stiffness * one, weakest)
-    yield _Part("world.obstacle_contact.damping", 2 * dt * material.damping * one, weakest)
+    weakest, unit = ends[[at]], np.ones(1)
+    yield _Part("world.obstacle_contact.stiffness", dt**2 * material.stiffness * unit, weakest)
+    yield _Part("world.obstacle_contact.damping", 2 * dt * material.damping * unit, weakest)
     if material.mu > 0.0:
         link = scenario.robot.links[at % len(half)]
         arm = (link.length / 2) ** 2 + link.radius**2
-        stopping = 2.0 / yielding(arm * one, link.mass * one, min(link.inertia) * one)
+        stopping = 2.0 / yielding(arm * unit, link.mass * unit, min(link.inertia) * unit)
         yield _Part("world.obstacle_contact.slip_speed", stopping, weakest)

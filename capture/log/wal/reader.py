@@ -79,7 +79,7 @@ class Recovery(Iterator[WalMessage]):
 
     Attributes:
         definitions: Headers, schemas, channels, metadata, attachments, in the order given.
-        found: Number of messages returned so far.
+        returned: Number of messages returned so far.
         before: Number of messages before the first one: released to the MCAP, or lost with their
             segment.
         missing: Number of messages missing between those found.
@@ -94,7 +94,7 @@ class Recovery(Iterator[WalMessage]):
             LogError: If the folder can't be listed.
         """
         self.folder = folder
-        self.found = self.before = self.missing = 0
+        self.returned = self.before = self.missing = 0
         self.warnings: list[str] = []
         segments = self._open()
         self._segments = [item for item in segments if item.header.stream == MESSAGES]
@@ -187,7 +187,7 @@ class Recovery(Iterator[WalMessage]):
             else:
                 self.before = gap
             last = head.position
-            self.found += 1
+            self.returned += 1
             if head.channel_id not in defined:
                 unknown.add(head.channel_id)
             yield WalMessage(
@@ -348,7 +348,7 @@ def recover(folder: Path | str) -> Recovery:
         recovery = recover("run.mcap.wal")
         for message in recovery:
             ...
-        print(recovery.found, recovery.missing, recovery.warnings)
+        print(recovery.returned, recovery.missing, recovery.warnings)
 
     Args:
         folder: The log, see :func:`.capture.log.wal.writer.wal_folder`.

@@ -212,12 +212,12 @@ def test_another_robot_is_one_of_which_most_frames_are_not_known():
     check = BusCheck(ROBOT)
     assert check.another_robot() is None
     check.add(frames_of(0x201, 0x202, MARK, MARK))
-    assert check.known == 2
+    assert check.recognised == 2
     assert check.strange == {MARK: 2}
     assert check.another_robot() is None  # as many of one as of the other
     more = [MARK + k for k in range(7, 0, -1) for _ in range(k)]
     check.add(frames_of(*more, MARK, 0x203))
-    assert (check.known, check.strange.total()) == (3, 31)
+    assert (check.recognised, check.strange.total()) == (3, 31)
     listed = ", ".join(f"{MARK + k:03X}" for k in range(7, 3, -1))
     assert check.another_robot() == (
         "another robot is on this bus: of 34 frames received 3 are of snake25; others have the "
@@ -230,7 +230,7 @@ def test_frames_that_are_no_data_of_others_are_not_counted():
     assert check.add(frames_of(0x101, MARK, way=DIR_TX)) is None  # an echo of our own
     assert check.add(frames_of(REMOTE_FLAG | 0x101, REMOTE_FLAG | MARK)) is None
     assert check.add(frames_of(ERROR_FLAG | 0x80)) is None
-    assert (check.known, check.strange.total()) == (0, 0)
+    assert (check.recognised, check.strange.total()) == (0, 0)
     fault = check.add(frames_of(0x201, ERROR_FLAG | BUS_OFF))
     assert fault.kind is FaultKind.BUS_OFF
     # The bit that tells bus-off in an error frame is part of usual identifiers.
@@ -251,4 +251,4 @@ def test_commands_of_another_controller_are_a_fault(others):
 def test_a_request_that_shares_its_identifier_with_a_reply_tells_nothing():
     check = BusCheck(load_robot("arcsnake-joint"))
     assert check.add(frames_of(MARK, MARK)) is None
-    assert (check.known, check.another_robot()) == (2, None)
+    assert (check.recognised, check.another_robot()) == (2, None)

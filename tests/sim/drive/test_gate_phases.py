@@ -116,7 +116,12 @@ def test_trouble_beside_the_robot_refuses_too_and_a_stop_ends_it_quietly():
         bench.step()
     bench = Bench(listen_s=0.5)
     step = bench.step(stop="asked")
-    assert (step.phase, step.command, step.wanted, step.gait) == (GatePhase.DONE, None, None, None)
+    assert (step.phase, step.command, step.requested, step.gait) == (
+        GatePhase.DONE,
+        None,
+        None,
+        None,
+    )
     assert bench.gate.outcome == Outcome(DriveEnding.STOPPED, "asked", "no command was sent")
     assert bench.gate.done
 
@@ -200,7 +205,7 @@ def test_a_command_that_gives_way_is_sent_and_what_was_wanted_is_told():
     bench = Bench(Still(0.1), duration_s=60.0).running(5)
     step = bench.step(lambda angle: angle.__setitem__(0, 0.06), current=1.5)
     assert step.command[0] == pytest.approx(0.06 + 0.8 * 0.04)
-    np.testing.assert_array_equal(step.wanted, bench.gait.pose)
+    np.testing.assert_array_equal(step.requested, bench.gait.pose)
 
 
 # -- faults and stops ---------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def test_a_session_gives_its_commands_and_what_explains_them(tmp_path):
     facts = {"settle_s": "0.02", "kernels": "numba", "driven": "gait"}
     word = written(tmp_path / "a.mcap", texts=TEXTS, plan=plan, gait=("A", "b"), **facts)
     motion = find_motion(word)
-    assert (motion.kind, motion.name, motion.robot, motion.own) == (
+    assert (motion.kind, motion.name, motion.robot, motion.origin) == (
         "commands",
         "a.mcap",
         ROBOT,
@@ -197,7 +197,7 @@ def test_a_plan_gives_its_text_its_planes_and_its_scenario(tmp_path):
     found, flat = find_motion(str(path)), sim.load_scenario("flat")
     assert (found.kind, found.name, found.duration_s) == ("plan", "bend", 0.75)
     assert (found.planes, found.robot) == ((Plane.HORIZONTAL, Plane.VERTICAL), flat.robot)
-    assert (found.world(), found.own, found.settle_s) == (flat, None, None)
+    assert (found.world(), found.origin, found.settle_s) == (flat, None, None)
     assert found.facts == {"driven": "plan", "driven.by": "bend"}
     assert found.attachments == {"plan.toml": PLAN.encode()}
     gait = found.make(ROBOT, nominal_world(ROBOT))  # it does not look at the world

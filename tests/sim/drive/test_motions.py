@@ -74,7 +74,7 @@ def test_the_scenario_of_a_run_is_its_world_with_what_the_motion_says():
 
 def test_a_gait_goes_with_its_controller_to_another_world():
     flat, weak = sim.load_scenario("flat"), sim.load_scenario("weak-servo-pi3")
-    made = source(own=weak).scenario(flat, None)
+    made = source(origin=weak).scenario(flat, None)
     assert (made.gait, made.controller) == (weak.gait, weak.controller)
     assert (made.robot, made.name) == (flat.robot, flat.name)
     with pytest.raises(UsageError) as refused:
@@ -84,7 +84,7 @@ def test_a_gait_goes_with_its_controller_to_another_world():
 
 def test_a_shipped_gait_is_found_with_its_scenario():
     found, flat = find_motion("flat"), sim.load_scenario("flat")
-    assert (found.kind, found.name, found.own, found.world()) == ("gait", "flat", flat, flat)
+    assert (found.kind, found.name, found.origin, found.world()) == ("gait", "flat", flat, flat)
     assert (found.duration_s, found.settle_s) == (flat.duration_s, flat.settle_s)
     assert found.facts == {"driven": "gait", "driven.by": "flat"}
     assert found.attachments == {"gait.toml": flat.toml().encode()}

@@ -134,7 +134,7 @@ def test_of_damaged_segments_is_read_what_a_plain_reader_finds(tmp_path, run):
         assert [one.position for one in recovery] == found
         missing = last - found[0] + 1 - len(found) if found else 0
         counts = len(found), found[0] - 1 if found else 0, missing
-        assert (recovery.found, recovery.before, recovery.missing) == counts
+        assert (recovery.returned, recovery.before, recovery.missing) == counts
         told += [f"{missing} messages are missing between those found"] * (missing > 0)
         told += ["messages of channels that are not defined: 9"] * (len(found) > 0)
         assert sorted(recovery.warnings) == sorted(told)

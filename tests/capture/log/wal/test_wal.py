@@ -32,7 +32,7 @@ def test_messages_come_back_bit_for_bit_over_many_segments(tmp_path):
     assert len(list(folder.glob("0*.seg"))) > 10
     recovery = recover(folder)
     assert check_messages(list(recovery)) == list(range(1, 201))
-    assert (recovery.found, recovery.before, recovery.missing) == (200, 0, 0)
+    assert (recovery.returned, recovery.before, recovery.missing) == (200, 0, 0)
     assert recovery.warnings == []
 
 

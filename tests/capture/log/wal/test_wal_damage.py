@@ -110,7 +110,7 @@ def test_damage_in_between_costs_only_what_it_hit(tmp_path):
     segment.write_bytes(raw)
     recovery = recover(folder)
     assert check_messages(list(recovery)) == sorted({*range(1, 61)} - {10, 30, 31, 32, 50})
-    assert (recovery.found, recovery.missing) == (55, 5)
+    assert (recovery.returned, recovery.missing) == (55, 5)
     damage, missing = recovery.warnings
     first = rf"the first at byte {places[9]}"
     assert re.fullmatch(rf"000001.seg: \d+ bytes are no whole records, {first}", damage)
@@ -229,7 +229,7 @@ def test_whatever_bytes_there_are_only_true_messages_come_out(tmp_path, quick_fo
             outcomes["none"] += 1
             continue
         positions = check_messages(found)
-        assert recovery.found == len(found)
+        assert recovery.returned == len(found)
         if found:
             gaps = sum(b - a - 1 for a, b in itertools.pairwise(positions))
             assert (recovery.before, recovery.missing) == (positions[0] - 1, gaps)
