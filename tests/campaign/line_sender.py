@@ -13,6 +13,7 @@ import random
 import select
 import struct
 import sys
+import termios
 import time
 import tty
 from pathlib import Path
@@ -38,11 +39,12 @@ def opened(path):
     new = path.with_suffix(".new")
     new.symlink_to(name)
     new.replace(path)
-    until = time.monotonic() + 60
-    while is_alone(master):
+    until, before = time.monotonic() + 60, termios.tcgetattr(master)
+    while is_alone(master) or termios.tcgetattr(master) == before:
         if time.monotonic() > until:
             sys.exit("nobody opened the port")
         time.sleep(0.01)
+    time.sleep(READ_S)  # a reader sets the port, then drops what came before
     return master
 
 

@@ -5,6 +5,7 @@ The senders are other processes; what ``send()`` returned to them is the truth.
 
 import ctypes
 import fcntl
+import math
 import os
 import random
 import select
@@ -29,6 +30,7 @@ from undulog.capture.common.process import raised_priority
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.source_clock import SourceClock
+from undulog.capture.sources import reader_thread
 from undulog.capture.sources.reader_thread import ReceiveThread
 
 # One frame a packet; at each line of stdin so many, with 0.1 ms between. A frame for which there is
@@ -90,8 +92,13 @@ def hold_the_interpreter(until):
 
 
 @pytest.mark.slow
-def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
-    """An AF_UNIX socket of the default size holds 277 such packets; the sender waits for room."""
+def test_packets_are_taken_while_the_interpreter_is_held(tmp_path, monkeypatch):
+    """An AF_UNIX socket of the default size holds 277 such packets; the sender waits for room.
+
+    The thread's room grows at any pace of the sender: 256 packets, then 1024 at a time, of which
+    1500 fill the first two and a part of the third.
+    """
+    monkeypatch.setattr(reader_thread, "_BRIEF_S", math.inf)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(str(tmp_path / "s"))
         listener.listen()
@@ -105,7 +112,7 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
                     stamps.extend(batch.stamps_ns)
                 return len(sizes) >= count
 
-            sender.start(1500)  # from now on there is room for 1024 at a time
+            sender.start(1500)
             accepted, _, _ = sender.result()
             wait_for(lambda: taken(accepted), "the first packets")
             before = accepted
@@ -257,6 +264,7 @@ def unread(sender):
 
 STOPPED = """
 import socket, sys, time
+from undulog.capture.sources import reader_thread
 from undulog.capture.sources.reader_thread import ReceiveThread
 ours = socket.socket(fileno=int(sys.argv[1]))
 receiver = ReceiveThread(ours, 100)

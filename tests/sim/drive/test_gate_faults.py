@@ -116,7 +116,7 @@ def test_a_process_that_comes_late_does_not_jump(driving):
     gate_stage.check_ramp_down(written, "fault: ")
 
 
-@pytest.mark.slow
+@pytest.mark.clock(0.02, "a robot in another process has to answer before the bus is silent")
 @pytest.mark.parametrize("plain", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving, tmp_path):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
