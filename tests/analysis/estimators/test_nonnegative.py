@@ -1,4 +1,4 @@
-"""Least squares without negative unknowns: SciPy's active set as a peer, and the conditions of it."""
+"""Least squares without negative unknowns: SciPy's active set, and the conditions of an optimum."""
 
 import numpy as np
 import pytest
