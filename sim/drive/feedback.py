@@ -147,7 +147,8 @@ class BusCheck:
         )
         return (
             f"another robot is on this bus: of {self.strange.total() + self.recognised} frames "
-            f"received {self.recognised} are of {self._robot_name}; others have the identifiers {listed}"
+            f"received {self.recognised} are of {self._robot_name}; others have the identifiers "
+            f"{listed}"
         )
 
 
