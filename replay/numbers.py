@@ -48,7 +48,7 @@ class Analysing(AbstractContextManager["Analysing"]):
         self._arguments = [str(path), *topics, *([] if robot is None else [robot])]
         self._process: subprocess.Popen[bytes] | None = None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115
         self._still = Standstill(LIMIT_S)
 
     def __exit__(self, *_: object) -> None:
@@ -58,7 +58,7 @@ class Analysing(AbstractContextManager["Analysing"]):
                 end_process(self._process, "the analysis of the session")
         finally:
             self._answer.close()
-            self._said.close()
+            self._stderr.close()
 
     def start(self) -> None:
         """Start it, unless it has been."""
@@ -68,7 +68,7 @@ class Analysing(AbstractContextManager["Analysing"]):
                 [sys.executable, "-P", "-m", __name__, *self._arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=self._answer,
-                stderr=self._said,
+                stderr=self._stderr,
                 process_group=0,  # a Ctrl-C ends it through us
             )
 
@@ -85,8 +85,8 @@ class Analysing(AbstractContextManager["Analysing"]):
             return Layer(None, notes=(f"not analysed: {why}; start the command again",))
         code = self._process.returncode
         if code:
-            self._said.seek(0)
-            lines = self._said.read().decode(errors="replace").split("\n")
+            self._stderr.seek(0)
+            lines = self._stderr.read().decode(errors="replace").split("\n")
             last = next((line for line in reversed(lines) if line.strip()), "")
             why = f": {last.strip()}" if last else ""
             return Layer(None, notes=(f"not analysed: the analysis ended with {code}{why}",))

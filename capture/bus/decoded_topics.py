@@ -149,7 +149,7 @@ class _Targets:
 
     def __init__(self, targets: Sequence[str]) -> None:
         self._index = {target: k for k, target in enumerate(targets)}
-        self._known: dict[int, tuple[tuple[BusSignal, ...], IntArray, list[int]]] = {}
+        self._cache: dict[int, tuple[tuple[BusSignal, ...], IntArray, list[int]]] = {}
 
     def members(self, signals: tuple[BusSignal, ...]) -> list[int]:
         """Return the members whose target is one of these."""
@@ -162,10 +162,10 @@ class _Targets:
     def _of(
         self, signals: tuple[BusSignal, ...]
     ) -> tuple[tuple[BusSignal, ...], IntArray, list[int]]:
-        entry = self._known.get(id(signals))  # kept with its key, so that the id stays its own
+        entry = self._cache.get(id(signals))  # kept with its key, so that the id stays its own
         if entry is None:
             index = np.array([self._index.get(s.target, -1) for s in signals], dtype=np.int64)
-            entry = self._known[id(signals)] = (signals, index, np.flatnonzero(index >= 0).tolist())
+            entry = self._cache[id(signals)] = (signals, index, np.flatnonzero(index >= 0).tolist())
         return entry
 
 

@@ -302,12 +302,12 @@ class _Source:
                 raise ImportFormatError(
                     table.path, f"has no column {name!r}; it has {some_names(table.columns, 20)}"
                 )
-        self._wanted = list(dict.fromkeys(names))
+        self._names = list(dict.fromkeys(names))
         self._order = 0 if role == COMMANDS else 1
         self._last_ns: int | None = None
         self._unwrapped: dict[str, tuple[float, float]] = {}
         self._missing: dict[str, int] = {}
-        self._blocks = table.read(self._wanted, self._time) if self.columns else iter(())
+        self._blocks = table.read(self._names, self._time) if self.columns else iter(())
 
     def first_ns(self) -> int:
         """Return the time of the first row [ns]."""

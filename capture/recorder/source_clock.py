@@ -256,7 +256,7 @@ class SourceClock:
     def __init__(self) -> None:
         """Start without samples."""
         self._envelope = Envelope()
-        self._own = False
+        self._has_clock = False
         self._device = self._host = 0  # of the last sample
         self._possible_ns = 0  # arrival of the last sample whose device time is possible
         self._front = 0  # the latest device time so far
@@ -320,15 +320,15 @@ class SourceClock:
 
     def restart(self) -> None:
         """Begin a new estimate with the next sample, after a failure."""
-        self._own, self._delays, self._waiting = False, [], 0
+        self._has_clock, self._delays, self._waiting = False, [], 0
         self._resets += 1
 
     def result(self) -> ClockEstimate:
         """Return the present estimate."""
         self._count_delays()
-        line, settled = self._envelope.line, self._own and self._envelope.settled
+        line, settled = self._envelope.line, self._has_clock and self._envelope.settled
         offset = drift = unsure = None
-        if self._own:
+        if self._has_clock:
             x = self._device - self._origin[0]
             offset = self._origin[1] + round(line.offset_ns + line.rate * x)
         if settled:
@@ -339,7 +339,7 @@ class SourceClock:
         most = int(reached[-1])
         place = int(np.searchsorted(reached, 0.99 * most)) if most else 0
         return ClockEstimate(
-            own_clock=self._own,
+            own_clock=self._has_clock,
             offset_ns=offset,
             drift_ppm=drift,
             drift_uncertainty_ppm=unsure,
@@ -356,11 +356,11 @@ class SourceClock:
         """Replace each impossible device time by the last possible one, or by the arrival's."""
         self._out_of_range += int(odd.sum())
         last = np.maximum.accumulate(np.where(odd, -1, np.arange(len(device))))
-        if not self._own and not odd.all():
+        if not self._has_clock and not odd.all():
             last = np.maximum(last, int(odd.argmin()))  # before the first, the one that follows
         t_ns = np.where(last < 0, self._device, device[last])
         came_ns = np.where(last < 0, self._possible_ns, host[last])
-        near = ((last >= 0) | self._own) & (host - came_ns <= JUMP_NS)
+        near = ((last >= 0) | self._has_clock) & (host - came_ns <= JUMP_NS)
         device[odd] = np.where(near, t_ns, host)[odd]
         self._possible_ns = int(came_ns[-1])
 
@@ -382,8 +382,8 @@ class SourceClock:
 
     def _map(self, device: IntArray, host: IntArray) -> IntArray:
         """Map samples with device times, split at half seconds and at jumps of the clock."""
-        if not self._own:
-            self._own = True
+        if not self._has_clock:
+            self._has_clock = True
             self._restart(int(device[0]), int(host[0]), Envelope())
         elif host[0] - self._host > SILENCE_NS and self._envelope.settled:
             self._after_silence(device, host)

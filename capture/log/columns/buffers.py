@@ -128,7 +128,7 @@ class EchoColumn:
         """
         self._dtype, self._capacity, self._others = dtype, capacity, others
         self._leader: EchoColumn | None = None
-        self._own: ColumnStore | None = None
+        self._store: ColumnStore | None = None
         self._count = 0
         self._last: tuple[int, NDArray[Any]] | None = None
 
@@ -143,15 +143,15 @@ class EchoColumn:
             rows: Shape (n,); never written to afterwards.
         """
         start, stop = self._count, self._count + len(rows)
-        if self._own is None and not start:
+        if self._store is None and not start:
             leads = (other for other in self._others if other.has(rows, 0))
             self._leader, self._others = next(leads, None), ()
         elif self._leader is not None and not self._leader.has(rows, start):
-            self._own = self._copied(stop)
+            self._store = self._copied(stop)
             self._leader = None
         if self._leader is None:
-            self._own = self._copied(stop) if self._own is None else self._own
-            self._own.append(rows)
+            self._store = self._copied(stop) if self._store is None else self._store
+            self._store.append(rows)
         self._count, self._last = stop, (start, rows)
 
     def has(self, rows: NDArray[Any], start: int) -> bool:
@@ -165,7 +165,7 @@ class EchoColumn:
         """All rows, shape (n,): a view, perhaps of another column."""
         if self._leader is not None:
             return self._leader.column()[: self._count]
-        return np.empty(0, self._dtype) if self._own is None else self._own.column()
+        return np.empty(0, self._dtype) if self._store is None else self._store.column()
 
     def _copied(self, capacity: int) -> ColumnStore:
         store = ColumnStore(self._dtype, 1, max(self._capacity, capacity))

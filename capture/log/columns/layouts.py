@@ -73,7 +73,7 @@ class LayoutSorter:
         self.is_full = False
         self._find, self._most, self._in_all = find, most, in_all
         self._kept: dict[int, list[tuple[int, Layout]]] = {}
-        self._found = self._kept_in_all = 0
+        self._total = self._kept_in_all = 0
 
     def sort(self, matrix: Matrix) -> Iterator[LayoutMessages]:
         """Sort messages of one length.
@@ -104,14 +104,14 @@ class LayoutSorter:
             except DataError as error:
                 yield LayoutMessages(rows[fits], error)
             else:
-                number = self._found
+                number = self._total
                 is_kept = (self._kept_in_all if self._in_all else len(kept)) < self._most
                 if is_kept:
                     kept.append((number, layout))
                     if len(rows) > 1:  # one message fits its own layout
                         fits = _fits(matrix, layout)
                         rest = ~fits
-                self._found += 1
+                self._total += 1
                 self._kept_in_all += is_kept
                 self.is_full |= not is_kept
                 yield LayoutMessages(rows[fits], layout, number, is_kept)

@@ -94,7 +94,7 @@ class DurableSink:
         self._half_interval_s = flush_interval_s / 2
         self._due = time.monotonic() + self._half_interval_s
         self._mark = 0  # messages that the part had one half of the interval ago
-        self._known: list[Description] = []
+        self._descriptions: list[Description] = []
         self.messages = 0
         self._last_words = last_words
         self._refused: LogWriteError | None = None
@@ -189,7 +189,7 @@ class DurableSink:
         self._refuse_closed()
         self._wal.define(record)
         write_description(self._writer, record)
-        self._known.append(record)
+        self._descriptions.append(record)
         self._disk.write(self._part, 0)
 
     def write(
@@ -305,7 +305,7 @@ class DurableSink:
         self._disk.finish(former, writer, (end,), self._wal.position)
         self._part, self._part_began = following, self.messages
         self._writer = self._new_writer()
-        for record in (*self._known, begin):
+        for record in (*self._descriptions, begin):
             write_description(self._writer, record)
         self._disk.write(self._part, 0)
         self._mark = 0
