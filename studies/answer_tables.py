@@ -19,8 +19,8 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from undulog.analysis.estimators.series import Series
+from undulog.analysis.parts.comparison.examine import Chain, examine
 from undulog.analysis.response.fitting import fit_gait
-from undulog.analysis.segments.examine import Chain, examine
 from undulog.capture.judgement.judge import judge
 from undulog.capture.judgement.motion import RecordedJoint, Samples
 

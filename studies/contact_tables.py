@@ -1,8 +1,8 @@
 """The table of docs/explanation/method.md on ground contact, of the twin, which knows it.
 
 ``nice .venv/bin/python studies/contact_tables.py [SEED ...]`` prints it as Markdown; a seed takes
-half a minute of CPU. The scales of ``analysis/body/ground_contact.py`` were chosen by seed 1, so it
-is none of those that are tried by default.
+half a minute of CPU. The scales of ``analysis/parts/ground_contact/measure.py`` were chosen by
+seed 1, so it is none of those that are tried by default.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from undulog.analysis.body.ground_contact import PHASES, TOUCHES, cycle_loads
 from undulog.analysis.estimators.series import Series
+from undulog.analysis.parts.ground_contact.measure import PHASES, TOUCHES, cycle_loads
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import load_scenario, run_batch
 

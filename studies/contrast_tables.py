@@ -14,8 +14,8 @@ from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import FundamentalNoise, residual_spectrum
+from undulog.analysis.parts.comparison.profile import scatter_of
 from undulog.analysis.response.response import respond
-from undulog.analysis.segments.profile import scatter_of
 
 JOINTS, RATE, OMEGA = 9, 100.0, 2 * np.pi * 0.97
 AMPLITUDE, GAIN, LAG = 0.5, 0.9, 0.3

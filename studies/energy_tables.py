@@ -11,7 +11,12 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
-from undulog.analysis.energy import TERMS, booked_energies, joint_energies, whole_robot
+from undulog.analysis.parts.energy.measure import (
+    TERMS,
+    booked_energies,
+    joint_energies,
+    whole_robot,
+)
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.signals.columns import RESPONSE_TOPIC, read_columns

@@ -23,7 +23,8 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.model import Robot
 
-from ..body.free_motion import (
+from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
+from ..parts.free_motion.measure import (
     MotionFit,
     Oscillation,
     amplitude,
@@ -31,7 +32,6 @@ from ..body.free_motion import (
     phase_line,
     travelling_index,
 )
-from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 from ..results.comparison import BODY
 from ..signals.columns import by_plane
 

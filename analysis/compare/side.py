@@ -20,15 +20,15 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.untrusted_text import read_toml
 
-from ..body.free_motion import MotionFit
-from ..body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
-from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
+from ..parts.body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
+from ..parts.energy.measure import in_all
+from ..parts.free_motion.measure import MotionFit
+from ..parts.joints.measure import SessionMeasurement
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, MetadataChange
 from ..session.analyse import measure_session
-from ..session.fields import SessionMeasurement
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span

@@ -17,10 +17,10 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.extras import base_versions
 from undulog.capture.robot.model import Robot
 
-from ..body.connection import MIN_GAITS
-from ..body.connection import MOST_CONDITION as MOST_SHAPE_CONDITION
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.predictions import body_oscillators
+from ..parts.body.connection import MIN_GAITS
+from ..parts.body.connection import MOST_CONDITION as MOST_SHAPE_CONDITION
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis

@@ -10,6 +10,7 @@ import numpy as np
 
 from undulog.capture.judgement.naming import NAMED
 
+from ..parts.comparison.words import fault_in_words
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.answer import Answer, NotFollowing
@@ -25,7 +26,6 @@ from ..results.coupling import (
 )
 from ..results.estimate import Estimate, leaves_out_zero
 from ..results.experiment import OrderedPair, Reversal
-from ..segments.words import fault_in_words
 from ..session.runs import Role
 from .pooling import PooledResponse
 from .reversal import SIGNIFICANT

@@ -28,9 +28,9 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ..response.excitation import ExcitationKind
-from ..response.frequency_response import joint_response, sound_lines
-from ..response.nonparametric import LineResponse, line_power, noise_power
+from ..parts.frequency_response.excitation import ExcitationKind
+from ..parts.frequency_response.measure import joint_response, sound_lines
+from ..parts.frequency_response.nonparametric import LineResponse, line_power, noise_power
 from ..results import formats
 from ..results.estimate import Estimate
 from ..results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse

@@ -10,9 +10,9 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 
-from ..body.connection import Connection, condition_of, distances, fit_connection
-from ..body.travel import GaitCycle, mean_step, wave_at
 from ..estimators.intervals import around
+from ..parts.body.connection import Connection, condition_of, distances, fit_connection
+from ..parts.body.travel import GaitCycle, mean_step, wave_at
 from ..results import formats
 from ..results.body import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
 from ..results.estimate import Estimate

@@ -14,9 +14,9 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 
 from ..estimators.series import Series
-from ..response.excitation import REPEATED, ExcitationKind, find_excitation
-from ..response.frequency_response import SAME_COMMAND
-from ..response.nonparametric import excited_lines, resampled
+from ..parts.frequency_response.excitation import REPEATED, ExcitationKind, find_excitation
+from ..parts.frequency_response.measure import SAME_COMMAND
+from ..parts.frequency_response.nonparametric import excited_lines, resampled
 from ..response.rhythm import DRIVEN_SHARE
 from ..signals.stretch import Options
 from .sweep_runs import read_signals

@@ -36,6 +36,7 @@ from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.null_model import NullModel, read_null_model
 
 from ..estimators.intervals import CONFIDENCE, t_factor
+from ..parts.joints.measure import SessionMeasurement
 from ..response.fitting import GaitFit
 from ..response.response import Response
 from ..results.analysis import Analysis
@@ -50,7 +51,6 @@ from ..results.comparison import (
 )
 from ..results.estimate import Estimate, Provenance
 from ..session.analyse import measure_session
-from ..session.fields import SessionMeasurement
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
 from .mirror import parts

@@ -21,15 +21,15 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.judgement.fault import Judgement
 from undulog.capture.robot.model import Robot
 
+from ..parts.comparison.answer import Facts, compose
+from ..parts.comparison.examine import Chain, examine
+from ..parts.comparison.profile import Scatter
+from ..parts.heterogeneity.measure import spread
 from ..response.response import Response
 from ..results.analysis import Analysis, Index
 from ..results.answer import Answer, NotFollowing
 from ..results.estimate import Interval
 from ..results.experiment import Reversal
-from ..segments.answer import Facts, compose
-from ..segments.examine import Chain, examine
-from ..segments.profile import Scatter
-from ..session.heterogeneity import spread
 from ..signals.columns import by_plane
 from .mirror import MIN_RUNS, parts
 

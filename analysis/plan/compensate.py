@@ -40,10 +40,10 @@ from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.model import Robot
 
 from ..experiment.pooling import pool_runs
+from ..parts.heterogeneity.measure import response_indices
 from ..response.response import Response
 from ..results.analysis import Index
 from ..results.coupling import LocalCoupling
-from ..session.heterogeneity import response_indices
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY, GaitRun, command_change
 from .runs import BaseGait
 

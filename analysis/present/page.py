@@ -46,13 +46,13 @@ from undulog.capture.common.process import interrupted_later
 from undulog.capture.common.waits import end_process
 
 from ..catalog.fleet import Fleet
+from ..parts.over_time.measure import CycleMaps
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.answer import beyond
 from ..results.comparison import Comparison
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment
-from ..session.cycles import CycleMaps
 from . import response_tables, tables
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
@@ -110,7 +110,8 @@ def render(
 
     Args:
         session: The open session of an ``Analysis``, to draw its samples, or None.
-        cycles: Of an ``Analysis``, from :func:`.analysis.session.cycles.cycle_maps`, or None.
+        cycles: Of an ``Analysis``, from
+            :func:`.analysis.parts.over_time.measure.cycle_maps`, or None.
 
     Returns:
         One HTML page without outside references; the same input gives the same text.

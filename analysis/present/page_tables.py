@@ -13,13 +13,13 @@ from markupsafe import Markup, escape
 from undulog.capture.common.console import plain
 
 from ..experiment.reversal import SIGNIFICANT
+from ..parts.comparison.answer import find
 from ..parts.shown import PAGE, Cell, Ends, PValue, ShownNumber, Table
 from ..results import formats
 from ..results.analysis import Analysis, Index, JointResult
 from ..results.coupling import LocalCoupling, RowCheck
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, Reversal
-from ..segments.answer import find
 
 STILL_RAD = 1e-6
 """A command with less amplitude than this holds its joint still [rad]."""

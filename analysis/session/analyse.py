@@ -12,19 +12,19 @@ from undulog.capture.common.extras import base_versions
 
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..parts.comparison.answer import Facts, compose
+from ..parts.gaits.measure import gait_windows
+from ..parts.joints.measure import SessionMeasurement, gait_facts
 from ..parts.part import in_order, measure
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, SessionFacts
 from ..results.answer import Remarks, led
 from ..results.estimate import Provenance
-from ..segments.answer import Facts, compose
 from ..signals.columns import drag_ratio
 from ..signals.session_signals import read_signals
 from ..signals.stretch import Options
 from . import parts
 from .added_parts import added_parts, checked
-from .fields import SessionMeasurement, gait_facts
-from .gaits import gait_windows
 from .runs import coupling_of_one_gait
 
 

@@ -9,27 +9,20 @@ from typing import Any
 
 from undulog.capture.common.console import Warn
 
-from ..body.free_motion import free_motion
-from ..body.ground_contact import ground_contact
-from ..body.motion import body_motion
-from ..body.shape import MeasuredShape, body_shape
-from ..dead_band.find import dead_bands
-from ..energy import Energies, check_ledger, energy_result, joint_energies, transport
 from ..estimators.series import Series
-from ..oscillators.chain import closed_loop, session_couplings
-from ..parts.part import Part, Results
-from ..parts.tracking.gait import gait_offsets
-from ..parts.tracking.measure import Tracked, track_joints
-from ..response.fitting import GaitFit, fit_at_period, fit_gait
-from ..response.frequency_response import frequency_responses
-from ..results.analysis import Index, JointResult
-from ..results.answer import KINDS, Artefact, DeadBand, Note, NotFollowing, Remarks, flags_by_joint
-from ..results.body import BodyResult, GroundContact
-from ..results.cycles import Closure, EnergyResult, ResponseOverTime
-from ..results.frequency_response import FreeMotion, JointFrequencyResponse
-from ..results.oscillators import ChainCoupling
-from ..segments.examine import Findings
-from ..segments.session import (
+from ..parts.artefacts.measure import find_artefacts
+from ..parts.body.motion import body_motion
+from ..parts.body.shape import MeasuredShape, body_shape
+from ..parts.comparison.examine import Findings
+from ..parts.dead_band.measure import dead_bands
+from ..parts.energy.measure import Energies, check_ledger, energy_result, joint_energies, transport
+from ..parts.free_motion.measure import free_motion
+from ..parts.frequency_response.measure import frequency_responses
+from ..parts.gaits.measure import FittedGait, gaits_in_windows
+from ..parts.ground_contact.measure import ground_contact
+from ..parts.heterogeneity.measure import heterogeneity_indices
+from ..parts.joints.measure import joint_results
+from ..parts.judgement.measure import (
     Following,
     compare_joints,
     following,
@@ -37,15 +30,22 @@ from ..segments.session import (
     stopped,
     unrefuted,
 )
-from ..signals.artefacts import find_artefacts
+from ..parts.oscillators.measure import closed_loop, session_couplings
+from ..parts.over_time.measure import response_over_time
+from ..parts.part import Part, Results
+from ..parts.tracking.gait import gait_offsets
+from ..parts.tracking.measure import Tracked, track_joints
+from ..response.fitting import GaitFit, fit_at_period, fit_gait
+from ..results.analysis import Index, JointResult
+from ..results.answer import KINDS, Artefact, DeadBand, Note, NotFollowing, Remarks, flags_by_joint
+from ..results.body import BodyResult, GroundContact
+from ..results.cycles import Closure, EnergyResult, ResponseOverTime
+from ..results.frequency_response import FreeMotion, JointFrequencyResponse
+from ..results.oscillators import ChainCoupling
 from ..signals.columns import by_plane
 from ..signals.session_signals import Signals
 from ..signals.stretch import series_in
 from ..signals.windows import Span, Stretch, whole_cycles
-from .cycles import response_over_time
-from .fields import joint_results
-from .gaits import FittedGait, gaits_in_windows
-from .heterogeneity import heterogeneity_indices
 
 UNDECIDED_ENDS = (
     "without a robot description the order of the joints is that of the record, and which end is "

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from undulog.analysis.parts.over_time.measure import CycleMaps
     from undulog.analysis.results.analysis import Analysis
-    from undulog.analysis.session.cycles import CycleMaps
     from undulog.capture.common.arrays import FloatArray
     from undulog.capture.robot.model import Plane, Robot
 

@@ -30,8 +30,8 @@ PARTS = {
     "write-ahead log": ["capture/log/wal"],
     "gate": ["sim/drive"],
     "estimators": ["analysis/estimators"],
-    "response": ["analysis/response"],
-    "energy": ["analysis/energy.py"],
+    "response": ["analysis/response", "analysis/parts/frequency_response"],
+    "energy": ["analysis/parts/energy/measure.py"],
     "samples of the replay": ["replay/samples"],
 }
 """What is mutated; as many of each part."""

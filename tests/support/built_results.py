@@ -3,6 +3,8 @@
 import dataclasses
 import math
 
+from undulog.analysis.parts.comparison.answer import Facts, compose
+from undulog.analysis.parts.comparison.examine import Findings
 from undulog.analysis.results.analysis import (
     Analysis,
     BodyPoint,
@@ -16,8 +18,6 @@ from undulog.analysis.results.analysis import (
 from undulog.analysis.results.answer import Shape
 from undulog.analysis.results.coupling import Coupling
 from undulog.analysis.results.estimate import Estimate, Provenance
-from undulog.analysis.segments.answer import Facts, compose
-from undulog.analysis.segments.examine import Findings
 
 
 def answered(analysis, shape=()):

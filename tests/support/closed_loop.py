@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from support import twin_chains
 from support.analysed import experiment as together
 from undulog.analysis.oscillators.predictions import felt_response, relaxation
-from undulog.analysis.oscillators.weak_form import read_phases
+from undulog.analysis.parts.oscillators.weak_form import read_phases
 from undulog.capture import Session
 from undulog.sim import GaitTick, load_scenario
 from undulog.sim.scenario.scenario import Kernels

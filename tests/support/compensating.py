@@ -16,10 +16,10 @@ from support.closed_loop import Sines
 from undulog.analysis.experiment.kick_coupling import kick_coupling
 from undulog.analysis.experiment.kick_runs import KickExperiment, sort_kicks
 from undulog.analysis.experiment.pooling import pool_runs
+from undulog.analysis.parts.heterogeneity.measure import response_indices
 from undulog.analysis.plan.compensate import KEEP, compensation
 from undulog.analysis.plan.runs import BaseGait
 from undulog.analysis.response.response import Response
-from undulog.analysis.session.heterogeneity import response_indices
 from undulog.analysis.session.runs import GaitRun
 from undulog.sim import load_scenario, run_batch
 

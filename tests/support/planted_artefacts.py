@@ -3,7 +3,7 @@
 import numpy as np
 
 from support.joint_runs import write_joints
-from undulog.analysis.signals.artefacts import find_artefacts
+from undulog.analysis.parts.artefacts.measure import find_artefacts
 from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, load_robot
 

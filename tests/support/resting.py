@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from undulog.analysis.dead_band.find import dead_bands
 from undulog.analysis.estimators.series import Series
+from undulog.analysis.parts.dead_band.measure import dead_bands
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.signals.columns import Columns
 from undulog.capture.log.read.sample_times import Signal

@@ -7,7 +7,7 @@ Everything is in complex numbers, x + j y in the axes of the head link.
 
 import numpy as np
 
-from undulog.analysis.body.travel import HARMONICS, GaitCycle, step_of_cycle, wave_at
+from undulog.analysis.parts.body.travel import HARMONICS, GaitCycle, step_of_cycle, wave_at
 
 _STEP = 1e-6
 

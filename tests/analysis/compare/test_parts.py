@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.body.travel import (
+from undulog.analysis.compare.quantities import Quantities
+from undulog.analysis.compare.side import changes, cycles_by_phase, phases_rad, turned
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.parts.body.travel import (
     GRAVITY,
     CycleSteps,
     centre_of_mass,
     cost_of_transport,
     speed,
 )
-from undulog.analysis.compare.quantities import Quantities
-from undulog.analysis.compare.side import changes, cycles_by_phase, phases_rad, turned
-from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
-from undulog.analysis.estimators.series import Series
 from undulog.analysis.results.comparison import MetadataChange
 from undulog.capture import load_robot
 from undulog.capture.robot.kinematics import quaternion_from_rotation

@@ -8,7 +8,7 @@ from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.intervals import response_errors
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise, residual_spectrum
-from undulog.analysis.segments.profile import scatter_of
+from undulog.analysis.parts.comparison.profile import scatter_of
 
 RATE, OMEGA, JOINTS = contrast_tables.RATE, contrast_tables.OMEGA, contrast_tables.JOINTS
 

@@ -16,7 +16,7 @@ from undulog.analysis.estimators.demodulation import (
 )
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.session.cycles import response_over_time
+from undulog.analysis.parts.over_time.measure import response_over_time
 from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session
 

@@ -10,7 +10,7 @@ from undulog.analysis.estimators.intervals import response_errors
 from undulog.analysis.estimators.quantisation import lattice_step
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import ResidualBins, residual_spectrum
-from undulog.analysis.segments.profile import scatter_of
+from undulog.analysis.parts.comparison.profile import scatter_of
 
 STEP = estimator_tables.STEP
 

@@ -10,7 +10,7 @@ from undulog.analysis.experiment.best_linear import (
     over_realisations,
     realisation_response,
 )
-from undulog.analysis.response.nonparametric import line_power
+from undulog.analysis.parts.frequency_response.nonparametric import line_power
 from undulog.analysis.results.estimate import Estimate
 
 N = 512

@@ -10,7 +10,7 @@ from undulog.analysis.experiment.best_linear import (
     realisation_response,
 )
 from undulog.analysis.experiment.distortion_spread import LevelSpread, distortion_spread
-from undulog.analysis.response.nonparametric import line_power
+from undulog.analysis.parts.frequency_response.nonparametric import line_power
 
 N, PERIODS = 256, 3
 LINES = np.array([k for k in range(1, 52, 2) if k % 8 != 5])  # a quarter of the odd lines left out

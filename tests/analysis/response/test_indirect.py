@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.excitation import find_excitation
-from undulog.analysis.response.frequency_response import estimate, frequency_responses
+from undulog.analysis.parts.frequency_response.excitation import find_excitation
+from undulog.analysis.parts.frequency_response.measure import estimate, frequency_responses
 
 STEP_S, COUNT, DRAWS = 0.01, 4000, 60
 POLE, SIZE, CONTROL = 0.6, 0.3, 0.8  # G = SIZE / (1 - POLE / z)

@@ -5,7 +5,11 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.nonparametric import find_tones, resampled, tone_response
+from undulog.analysis.parts.frequency_response.nonparametric import (
+    find_tones,
+    resampled,
+    tone_response,
+)
 
 TONES = np.array([0.31, 0.5, 0.83, 1.4, 2.3])
 RESPONSE = np.array([0.99, 0.9, 0.7, 0.4, 0.2]) * np.exp(-1j * np.array([0.1, 0.3, 0.8, 1.5, 2.2]))

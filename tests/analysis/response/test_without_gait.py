@@ -7,7 +7,7 @@ from support.analysed import analysed
 from support.joint_runs import write_joints
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.series import Series, moves
-from undulog.analysis.response.excitation import find_excitation
+from undulog.analysis.parts.frequency_response.excitation import find_excitation
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.response.groups import Groups
 from undulog.analysis.response.rhythm import Rhythm

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.analysed import analysed
-from undulog.analysis.body.null import SAMPLES, one_cycle, places, viscous_chain
+from undulog.analysis.parts.body.null import SAMPLES, one_cycle, places, viscous_chain
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from undulog.analysis.parts.over_time.measure import CycleMaps
 from undulog.analysis.results.cycles import (
     EnergyResult,
     JointCycles,
@@ -14,7 +15,6 @@ from undulog.analysis.results.cycles import (
     Transport,
 )
 from undulog.analysis.results.estimate import Estimate
-from undulog.analysis.session.cycles import CycleMaps
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.body import power_colors

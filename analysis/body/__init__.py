@@ -1,1 +1,0 @@
-"""Head, middle and tail in the plane, and how they would move with perfectly tracking joints."""

@@ -1,0 +1,1 @@
+"""Motion, shape and travel of the whole body."""

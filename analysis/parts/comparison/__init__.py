@@ -1,0 +1,1 @@
+"""Comparison of the joints of a session, and what it says."""

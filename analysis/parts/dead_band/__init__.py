@@ -1,0 +1,1 @@
+"""Stick and play: dead bands at the reversals of a joint."""

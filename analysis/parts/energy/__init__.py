@@ -1,0 +1,1 @@
+"""Energies of joints, cost of transport, and the twin's ledger."""

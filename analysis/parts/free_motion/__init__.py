@@ -1,0 +1,1 @@
+"""A motion without commands: its waves along the body."""

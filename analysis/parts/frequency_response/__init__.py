@@ -1,0 +1,1 @@
+"""Frequency responses of joints, from any excitation."""

@@ -1,0 +1,1 @@
+"""Which links are on the ground, from the joints' torques."""

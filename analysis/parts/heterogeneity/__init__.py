@@ -1,0 +1,1 @@
+"""Indices of heterogeneity along the body."""

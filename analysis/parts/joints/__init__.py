@@ -1,0 +1,1 @@
+"""One row a joint: what is measured of it."""

@@ -1,0 +1,1 @@
+"""Whether joints follow their commands."""

@@ -1,0 +1,1 @@
+"""Couplings of the controller's oscillators, as recorded."""

@@ -1,0 +1,1 @@
+"""Responses cycle by cycle."""

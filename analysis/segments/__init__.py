@@ -1,1 +1,0 @@
-"""Which segments respond differently, and in which shape the rest differs."""
