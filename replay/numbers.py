@@ -121,7 +121,9 @@ def computed(session: SessionView, options: Options | None = None) -> Layer:
         The layer, with a note where there are no numbers.
     """
     try:
-        measured = measure_session(session, options, without=("dead_band", "body"))
+        measured = measure_session(
+            session, options, without=("dead_band", "body", "ground_contact")
+        )
     except UndulogError as error:
         return Layer(None, notes=(f"not analysed: {error}",))
     analysis = measured.analysis

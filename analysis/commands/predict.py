@@ -211,7 +211,9 @@ def _runs(
     runs: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:
-            fitted = measure_session(session, options, without=("dead_band", "body"))
+            fitted = measure_session(
+                session, options, without=("dead_band", "body", "ground_contact")
+            )
             runs.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
     return tuple(runs)
 

@@ -61,7 +61,7 @@ def base_gait(session: SessionView) -> BaseGait:
     Raises:
         UsageError: If it commands no steady gait of sines.
     """
-    gait = measure_session(session, without=("dead_band", "body")).gait
+    gait = measure_session(session, without=("dead_band", "body", "ground_contact")).gait
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
     if gait.others:

@@ -98,8 +98,8 @@ def checked(part: Part[Any], result: object) -> object:
 
 
 def shown(name: str, result: object) -> Shown | None:
-    """Return tables and figures of the result of an added part; None where it shows nothing."""
-    part = next((part for part in added_parts() if part.name == name), None)
+    """Return tables and figures of the result of a part; None where it shows nothing."""
+    part = next((part for part in (*PARTS, *added_parts()) if part.name == name), None)
     if part is None or part.show is None or not isinstance(result, part.result or ()):
         return None
     return part.show(result)

@@ -12,10 +12,25 @@ from undulog.capture.common.extras import base_versions
 
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..parts.artefacts.part import ARTEFACTS
+from ..parts.body.part import BODY, MeasuredBody
 from ..parts.comparison.answer import Facts, compose
+from ..parts.comparison.part import COMPARISON
+from ..parts.energy.part import ENERGIES, ENERGY
+from ..parts.free_motion.part import FREE_MOTION
+from ..parts.frequency_response.part import FREQUENCY_RESPONSE
+from ..parts.gait.part import GAIT
 from ..parts.gaits.measure import gait_windows
+from ..parts.gaits.part import GAITS
+from ..parts.ground_contact.part import GROUND_CONTACT
+from ..parts.heterogeneity.part import HETEROGENEITY
 from ..parts.joints.measure import SessionMeasurement, gait_facts
+from ..parts.joints.part import JOINTS
+from ..parts.judgement.part import JUDGEMENT
+from ..parts.oscillators.part import CLOSED_LOOP, OSCILLATORS
+from ..parts.over_time.part import OVER_TIME
 from ..parts.part import in_order, measure
+from ..parts.tracking.part import TRACKING
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, SessionFacts
 from ..results.answer import Remarks, led
@@ -23,8 +38,8 @@ from ..results.estimate import Provenance
 from ..signals.columns import drag_ratio
 from ..signals.session_signals import read_signals
 from ..signals.stretch import Options
-from . import parts
 from .added_parts import added_parts, checked
+from .parts import PARTS
 from .runs import coupling_of_one_gait
 
 
@@ -49,7 +64,8 @@ def measure_session(
 
     Args:
         without: Names of parts that nothing asks for: ``dead_band`` takes a third of the time of a
-            short session, ``body`` two fifths of that of a long one. A motion without commands is
+            short session, ``body`` and ``ground_contact`` two fifths
+            of that of a long one. A motion without commands is
             known by the body's, which is then measured all the same. Parts of other packages are
             measured where nothing is left out.
 
@@ -61,14 +77,15 @@ def measure_session(
     options, remarks = options or Options(), Remarks()
     signals = read_signals(session, options, remarks)
     added = () if without else added_parts()
-    every = (*parts.PARTS, *added)
+    every = (*PARTS, *added)
+    shown = [part for part in every if part.result is not None]
     chosen = {part.name for part in every} - {*without}
     if signals.columns.command:
-        chosen -= {parts.FREE_MOTION.name}
+        chosen -= {FREE_MOTION.name}
     done = measure(in_order(every, chosen), signals, remarks)
     session, columns = signals.session, signals.columns
-    gait, artefacts, judged = done[parts.GAIT], done[parts.ARTEFACTS], done[parts.JUDGEMENT]
-    body, tracked = done.get(parts.BODY, parts.MeasuredBody()), done[parts.TRACKING]
+    gait, artefacts, judged = done[GAIT], done[ARTEFACTS], done[JUDGEMENT]
+    body, tracked = done.get(BODY, MeasuredBody()), done[TRACKING]
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -79,32 +96,32 @@ def measure_session(
             verdict=session.verdict,
         ),
         gait=gait_facts(session, gait.fit, gait.span, signals.window),
-        joints=done[parts.JOINTS],
-        gaits=gait_windows(session.robot, done[parts.GAITS], session.start_ns),
+        joints=done[JOINTS],
+        gaits=gait_windows(session.robot, done[GAITS], session.start_ns),
         body=body.motion,
         body_shape=body.measured.shape,
-        ground_contact=body.contact,
-        heterogeneity=done[parts.HETEROGENEITY],
+        ground_contact=done.get(GROUND_CONTACT, None),
+        heterogeneity=done[HETEROGENEITY],
         coupling=coupling_of_one_gait(0 if gait.fit is None else len(gait.fit.all_answered)),
-        free_motion=done.get(parts.FREE_MOTION, None),
-        closed_loop=done[parts.CLOSED_LOOP],
+        free_motion=done.get(FREE_MOTION, None),
+        closed_loop=done[CLOSED_LOOP],
         warnings=remarks.warnings(session.warnings),
         provenance=_provenance(session, signals.options),
         artefacts=artefacts.whole,
-        over_time=done[parts.OVER_TIME],
-        energy=done[parts.ENERGY],
-        frequency_response=done[parts.FREQUENCY_RESPONSE],
+        over_time=done[OVER_TIME],
+        energy=done[ENERGY],
+        frequency_response=done[FREQUENCY_RESPONSE],
         tracking=tracked.joints,
-        oscillators=done[parts.OSCILLATORS],
+        oscillators=done[OSCILLATORS],
         notes=remarks.notes,
-        more={part.name: checked(part, done[part]) for part in added if done[part] is not None},
+        more={part.name: checked(part, done[part]) for part in shown if done[part] is not None},
     )
     facts = Facts(
         analysis.gait,
         analysis.joints,
         columns.commanded(),
         judged.faulty,
-        done[parts.COMPARISON],
+        done[COMPARISON],
         analysis.warnings,
         frequency_response=analysis.frequency_response,
         tracking=tracked.joints,
@@ -118,7 +135,7 @@ def measure_session(
         analysis,
         gait.fit,
         artefacts.sound,
-        done[parts.ENERGIES].joints,
+        done[ENERGIES].joints,
         gait.span,
         judged.following.offsets,
         motion=None if columns.command else body.measured.motion,

@@ -179,7 +179,7 @@ def joined(sessions: Sequence[Recorded]) -> MeasuredAngles:
 def _omega(session: SessionView) -> float | None:
     """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
     try:
-        gait = measure_session(session, without=("dead_band", "body")).gait
+        gait = measure_session(session, without=("dead_band", "body", "ground_contact")).gait
     except UndulogError:  # a session without a gait can be fitted, too
         return None
     return None if gait is None or not gait.driven else gait.fit.omega

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.log.read.sample_times import Signal
@@ -126,10 +126,11 @@ def _moments(
     Returns:
         Torques [m], sum [1] and moment [m] per unit force, shape (n, m + 6, m + 1, 3).
     """
-    links, joints = point.shape[1], pivot.shape[1]
-    behind: BoolArray = np.arange(links) > np.arange(joints)[:, None]
-    about: FloatArray = np.cross(axis[:, :, None], point[:, None] - pivot[:, :, None])
-    about *= behind[..., None]
+    links: int = point.shape[1]
+    behind = np.arange(links) > np.arange(links - 1)[:, None]
+    arms = point[:, None] - pivot[:, :, None]
+    torques: FloatArray = np.cross(axis[:, :, None], arms)
+    about: FloatArray = np.where(behind[..., None], torques, 0.0)
     whole = np.cross(np.eye(3)[:, None], (point - middle[:, None])[:, None])
     force = np.broadcast_to(np.eye(3)[:, None], whole.shape)
     return np.concatenate([-about, force, whole], axis=1)

@@ -7,7 +7,7 @@ from undulog.analysis.session.parts import PARTS
 
 ORDER = (
     "judgement artefacts gait dead_band frequency_response tracking gaits energies joints energy "
-    "over_time body heterogeneity comparison free_motion closed_loop oscillators"
+    "over_time body ground_contact heterogeneity comparison free_motion closed_loop oscillators"
 )
 """In which remarks have always come."""
 

@@ -1,0 +1,1 @@
+"""The part that fits the gait of the window."""

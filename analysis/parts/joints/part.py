@@ -1,0 +1,77 @@
+"""The part that puts together what is measured of each joint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from undulog.capture.common.console import Warn
+
+from ...response.fitting import GaitFit
+from ...results.analysis import JointResult
+from ...results.answer import KINDS, Artefact, Remarks, flags_by_joint
+from ...signals.session_signals import Signals
+from ..artefacts.part import ARTEFACTS
+from ..dead_band.part import DEAD_BAND
+from ..energy.part import ENERGIES
+from ..gait.part import GAIT
+from ..part import Part, Results
+from ..tracking.part import TRACKING
+from .measure import joint_results
+
+
+def _joints(signals: Signals, done: Results, remarks: Remarks) -> tuple[JointResult, ...]:
+    held, gait = done[ARTEFACTS].window, done[GAIT]
+    joints = joint_results(
+        signals.robot,
+        signals.columns,
+        responses=signals.responses,
+        gait=gait.fit,
+        energies=done[ENERGIES].joints,
+        flags=flags_by_joint(held),
+        dead=done.get(DEAD_BAND, {}),
+        offsets=done[TRACKING].offsets,
+        span=gait.span,
+    )
+    _warn_flags(held, joints, gait.fit, remarks)
+    return joints
+
+
+def _warn_flags(
+    artefacts: Iterable[Artefact], joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn
+) -> None:
+    """Warn of each kind of artefact with its joints, and of responses lost in noise."""
+    joined: dict[tuple[str, str, str], list[Artefact]] = {}
+    for artefact in artefacts:
+        key = artefact.flag, artefact.quantity, artefact.topic
+        joined.setdefault(key, []).append(artefact)
+    for (flag, quantity, topic), same in joined.items():
+        if flag == "gaps":  # of the whole session; those that matter are in the joints' flags
+            continue
+        about, text = KINDS[flag]
+        where = f"{quantity} on {topic}" if topic else quantity
+        nulls = "; gain and lag are null" if same[0].falsifies("position") else ""
+        meaning = {
+            "sensor": f"an artefact of the sensor, not mechanics{nulls}",
+            "sensor or joint": f"the sensor or the joint itself, see the answer{nulls}",
+            "sensor or limit": "the sensor or a limit of the servo",
+            "record": "an artefact of the record, not mechanics",
+            "limit": "a limit of the robot, not a fault of the sensor",
+        }[about]
+        notes = ", ".join(dict.fromkeys(artefact.note for artefact in same if artefact.note))
+        named = f"{flag}, {notes}" if notes else flag
+        names = ", ".join(artefact.joint for artefact in same)
+        warn(f"{names}: {where}: values {text} ({named}): {meaning}")
+    if holed := [joint.name for joint in joints if "gaps" in joint.flags]:
+        warn(f"{', '.join(holed)}: positions have gaps (an artefact of the record, not mechanics)")
+    answered = () if gait is None else gait.all_answered
+    silent = [joint.name for joint in joints if joint.lag_rad.value is None]
+    if lost := [name for name in silent if name in answered]:
+        warn(
+            f"{', '.join(lost)}: no response at the gait frequency that differs from noise: "
+            "gain and lag are null"
+        )
+
+
+JOINTS = Part("joints", _joints, ("artefacts", "gait", "tracking", "energies"), ("dead_band",))
+
+PARTS = (JOINTS,)
