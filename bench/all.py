@@ -114,7 +114,9 @@ def run_bench(name: str, *, quick: bool) -> dict[str, Any]:
         "took_s": round(time.monotonic() - clock, 1),
         "load": round(os.getloadavg()[0], 1),
         "machine": machine(),
-        "versions": ", ".join(versions(one) for one in ("undulog", *PEERS) if installed(one)),
+        "versions": ", ".join(
+            versions(package) for package in ("undulog", *PEERS) if installed(package)
+        ),
         "exit": code,
         "rows": rows,
     }
@@ -136,8 +138,8 @@ def machine() -> str:
     model = next(line.partition(":")[2].strip() for line in facts if line.startswith("model name"))
     gpus = [
         line.partition(":")[2].strip()
-        for one in Path("/proc/driver/nvidia/gpus").glob("*/information")
-        for line in one.read_text().splitlines()
+        for information in Path("/proc/driver/nvidia/gpus").glob("*/information")
+        for line in information.read_text().splitlines()
         if line.startswith("Model:")
     ]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
@@ -157,7 +159,7 @@ def main() -> int:
     for name in [] if options.page_only else options.only or BENCHES:
         data[name] = run_bench(name, quick=options.quick)
         failed |= any(row["met"] is False for row in data[name]["rows"])
-        ordered = {one: data[one] for one in BENCHES if one in data}
+        ordered = {name: data[name] for name in BENCHES if name in data}
         partial = DATA.with_suffix(".partial")
         partial.write_text(json.dumps(ordered, indent=1) + "\n")
         partial.replace(DATA)

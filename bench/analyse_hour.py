@@ -114,11 +114,11 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
     ):
         what = f"undulog {verb}, {length}"
         took, peaks = zip(*costs, strict=True)
-        ours = [one.processor_s for one in took]
+        ours = [usage.processor_s for usage in took]
         good.append(compared(what, ours, decoding, peer, bar=bar, scale=seconds / peer_s))
-        verdict(f"{what}, wall-clock time", min(one.wall_s for one in took), None, "s")
+        verdict(f"{what}, wall-clock time", min(usage.wall_s for usage in took), None, "s")
         good.append(verdict(f"{what}, peak memory", max(peaks), bar_mib, "MiB"))
-    what, ours = f"undulog analyse, {length}", [one.processor_s for one, _ in analysed]
+    what, ours = f"undulog analyse, {length}", [usage.processor_s for usage, _ in analysed]
     good.append(compared(what, ours, reading, "undulog reading its columns", bar=OF_READING))
     size = page.stat().st_size / MIB
     good.append(verdict(f"undulog report, {length}, page", size, round(PAGE_MIB, 2), "MiB"))

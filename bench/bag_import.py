@@ -83,8 +83,8 @@ def decode(bag: Path) -> None:
 def read(bag: Path) -> None:
     """Read commands and responses, found by type."""
     with Session.open(bag) as session:
-        found = session.joint_topics()
-        names = {found.command, found.response}
+        topics = session.joint_topics()
+        names = {topics.command, topics.response}
         session.joint_columns({name: ["position"] for name in names if session.joint_channel(name)})
 
 
@@ -99,7 +99,7 @@ def measure(name: str, bag: Path, runs: int) -> bool:
     works = [partial(took, partial(work, bag)) for work in (read, brought_in, decode)]
     in_turn(1, *works)  # what is imported late is imported now
     opened, imported, peer = (
-        [each.processor_s for each in turns] for turns in in_turn(runs, *works)
+        [usage.processor_s for usage in turns] for turns in in_turn(runs, *works)
     )
     rosbags = versions("rosbags")
     compared(f"open and read a bag, {name}", opened, peer, rosbags)

@@ -34,8 +34,8 @@ def apart(scenario: Scenario) -> bool:
     expected = run_batch(runs)
     good = True
     for dtype, angles, gains in ((np.float64, 1e-6, 1e-5), (np.float32, 1e-3, 1e-3)):
-        found = run_batch(runs, dtype=dtype, device="cuda")
-        pairs = list(zip(found, expected, strict=True))
+        on_gpu = run_batch(runs, dtype=dtype, device="cuda")
+        pairs = list(zip(on_gpu, expected, strict=True))
         far = max(np.abs(a.angle - b.angle)[:101].max() for a, b in pairs)
         gain = max(np.abs(swing(a) / swing(b) - 1).max() for a, b in pairs)
         name = dtype.__name__
@@ -71,7 +71,7 @@ def main() -> None:
         scenario = dataclasses.replace(weak, robot=chain(weak.robot, joints))
         for dtype in (np.float64, np.float32):
             core = 0.0
-            for device, worlds in (("cpu", 64), *(("cuda", one) for one in options.worlds)):
+            for device, worlds in (("cpu", 64), *(("cuda", count) for count in options.worlds)):
                 used = batch_took(scenario, worlds, dtype, device).wall_s
                 rate = worlds * scenario.duration_s * scenario.physics_rate_hz / used
                 if device == "cpu":

@@ -50,8 +50,10 @@ def servos_of(scenario: Scenario, worlds: int) -> list[Scenario]:
     runs: list[Scenario] = []
     for k in range(worlds):
         joints = tuple(
-            dataclasses.replace(one, servo=dataclasses.replace(one.servo, supply_v=5 + k / worlds))
-            for one in scenario.robot.joints
+            dataclasses.replace(
+                joint, servo=dataclasses.replace(joint.servo, supply_v=5 + k / worlds)
+            )
+            for joint in scenario.robot.joints
         )
         robot = dataclasses.replace(scenario.robot, joints=joints)
         runs.append(dataclasses.replace(scenario, robot=robot))
@@ -64,7 +66,7 @@ def batch_took(
     """Return the cost of a batch; the servos differ from run to run."""
     runs, done = servos_of(scenario, worlds), []
     used = took(lambda: done.extend(run_batch(runs, dtype=dtype, device=device)))
-    assert all(one.error is None for one in done), [str(one.error) for one in done]
+    assert all(output.error is None for output in done), [str(output.error) for output in done]
     return used
 
 
@@ -132,12 +134,14 @@ def agreement(scenario: Scenario) -> bool:
     (double,), (single,) = run_batch([whole]), run_batch([whole], dtype=np.float32)
     yaw = whole.robot.joint_indices(Plane.HORIZONTAL)
     wave = whole.gait.planes[Plane.HORIZONTAL]
-    found = [
+    responses = [
         response(angle[:, yaw], double.command[:, yaw], wave.frequency_hz)
         for angle in (expected, double.angle, single.angle)
     ]
     apart = np.abs(double.angle - expected)[:101].max() / wave.amplitude
-    double_error, single_error = (float(np.abs(one - found[0]).max()) for one in found[1:])
+    double_error, single_error = (
+        float(np.abs(other - responses[0]).max()) for other in responses[1:]
+    )
     good = [
         verdict(f"batch: {what}", value, bar, "", peer=PEER)
         for what, value, bar in (
@@ -177,12 +181,12 @@ def main() -> None:
                 step_rollout, scenario, 16, contacts=True
             ),
         }
-        found = turns(ways, options.rounds)
-        for (name, worlds), costs in found.items():
+        step_us = turns(ways, options.rounds)
+        for (name, worlds), costs in step_us.items():
             us = min(costs)
             print(f"{name:<38}{worlds:>7}{joints:>7}{us:>11.2f}{1e6 / us:>11,.0f}", flush=True)
         if joints == 25:
-            whole = found
+            whole = step_us
     batch, single = whole["batch, float64", 64], whole[ON_MUJOCO, 1]
     what = "step of 25 joints, batch of 64, float64"
     failed |= not compared(what, batch, single, f"single runs on {PEER}", bar=1 / 3, unit="us")

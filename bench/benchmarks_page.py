@@ -54,12 +54,12 @@ def page_of(data: dict[str, Any], missing: Sequence[str] = ()) -> str:
         "| bench | command | date (UTC) | length | load | took | exit code | machine |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    hosts = list(dict.fromkeys((one["machine"], one["versions"]) for one in data.values()))
+    hosts = list(dict.fromkeys((bench["machine"], bench["versions"]) for bench in data.values()))
     parts += [
-        f"| {name} | `{one['command']}` | {one['date'][:16].replace('T', ' ')} "
-        f"| {'quick' if one['quick'] else 'full'} | {one['load']} | {one['took_s']:.0f} s "
-        f"| {one['exit']} | {_letter(hosts.index((one['machine'], one['versions'])))} |"
-        for name, one in data.items()
+        f"| {name} | `{bench['command']}` | {bench['date'][:16].replace('T', ' ')} "
+        f"| {'quick' if bench['quick'] else 'full'} | {bench['load']} | {bench['took_s']:.0f} s "
+        f"| {bench['exit']} | {_letter(hosts.index((bench['machine'], bench['versions'])))} |"
+        for name, bench in data.items()
     ]
     parts += ["\n## Machines and versions\n"]
     for k, (machine, versions) in enumerate(hosts):

@@ -169,10 +169,10 @@ def main() -> None:
         with ProcessPoolExecutor(WRITERS, get_context("spawn")) as pool:
             (folder / FOLDER).rename(folder / "away")
             done = list(pool.map(add, [name] * WRITERS, range(WRITERS)))
-        found = Catalog(name).sql(
+        counts = Catalog(name).sql(
             "select count(*) as n, count(distinct path) as paths from catalog"
         )
-        complete = found.n[0] == found.paths[0] == given.sessions and len(done) == WRITERS
+        complete = counts.n[0] == counts.paths[0] == given.sessions and len(done) == WRITERS
         what = f"catalog: {WRITERS} writers at once, each session once"
         good.append(verdict(what, float(complete), 1, "", most=False))
     with tempfile.TemporaryDirectory(prefix="undulog-bench-") as name:
@@ -185,7 +185,7 @@ def main() -> None:
         pandas = f"{versions('pandas')} over JSON lines"
         what = f"catalog: query of {given.rows} rows"
         for k, bar, unit, more in ((0, QUERY, "s", ""), (2, MEMORY, "MB", ", peak memory")):
-            costs = [[each[k] for each in side] for side in turns]
+            costs = [[figures[k] for figures in side] for side in turns]
             good.append(compared(what + more, *costs, pandas, bar=bar, unit=unit))
     sys.exit(not all(good))
 

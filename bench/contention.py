@@ -85,8 +85,8 @@ def contention(folder: Path) -> Iterator[None]:
     disk = f"{alive}; do dd if=/dev/zero of={folder / 'dd'} bs=1M count=64 conv=fsync; done"
     commands = [loops] * (2 * (os.cpu_count() or 1)) + [["sh", "-c", disk]]
     running = [
-        subprocess.Popen(each, stderr=subprocess.DEVNULL, start_new_session=True)
-        for each in commands
+        subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+        for command in commands
     ]
     try:
         yield
@@ -158,7 +158,7 @@ def judged(name: str, folder: Path, stamps: Sequence[dict[int, int] | int], cpu:
         cpu: The recorder's processor share.
     """
     total = Shares(name, 0, 0, 0, 0, None, 0.0, cpu)
-    for k, found in enumerate(stamps):
+    for k, stamp in enumerate(stamps):
         with np.load(folder / f"sent-{k}.npz") as noted:
             sent_ns = noted["sent_ns"]
         number = np.arange(len(sent_ns))
@@ -167,11 +167,11 @@ def judged(name: str, folder: Path, stamps: Sequence[dict[int, int] | int], cpu:
         refused = sent_ns == 0
         total.refused += int((refused & ~begun).sum())
         total.start_refused += int((refused & begun).sum())
-        if isinstance(found, int):
-            total.lost += int((~refused).sum()) - found
+        if isinstance(stamp, int):
+            total.lost += int((~refused).sum()) - stamp
             continue
         kept = np.zeros(len(sent_ns), dtype=np.int64)
-        kept[np.fromiter(found, np.int64)] = np.fromiter(found.values(), np.int64)
+        kept[np.fromiter(stamp, np.int64)] = np.fromiter(stamp.values(), np.int64)
         total.lost += int(((kept == 0) & ~refused).sum())
         both = (kept > 0) & ~refused & ~begun
         apart = np.abs(kept[both] - sent_ns[both])
@@ -252,21 +252,21 @@ def measure(
         for kind, packet in (("unix", 1), ("unix", 9), ("socketcand", 1))
     }
     cases["python-can"] = partial(python_can, seconds=seconds)
-    found = []
+    shares = []
     for name, run in cases.items():
         for _ in range(runs if only in name else 0):
             with tempfile.TemporaryDirectory(prefix="undulog-bench-", dir=folder) as place:
-                found.append(run(folder=Path(place)))
-            print(found[-1].line(), flush=True)
-    return found
+                shares.append(run(folder=Path(place)))
+            print(shares[-1].line(), flush=True)
+    return shares
 
 
-def judge(found: Sequence[Shares]) -> bool:
+def judge(outcomes: Sequence[Shares]) -> bool:
     """Print and keep the figures of the runs by case; return whether all bars are met."""
     good: list[bool] = []
-    for name in dict.fromkeys(each.name for each in found if each.name != PYTHON_CAN):
-        runs = [each for each in found if each.name == name]
-        counts = [(each.offered, each.refused, each.late or 0, each.lost) for each in runs]
+    for name in dict.fromkeys(share.name for share in outcomes if share.name != PYTHON_CAN):
+        runs = [share for share in outcomes if share.name == name]
+        counts = [(run.offered, run.refused, run.late or 0, run.lost) for run in runs]
         offered, *shares, lost = np.sum(counts, axis=0).tolist()
         refused, late = (100 * count / offered for count in shares)
         what = f"contention, {name}"
@@ -275,11 +275,11 @@ def judge(found: Sequence[Shares]) -> bool:
         good.append(verdict(f"{what}: refused", refused, bar, "%"))
         if "granted" in name:
             good.append(verdict(f"{what}: stamped > 5 ms off", late, 0.1, "%"))
-    peers = [each for each in found if each.name == PYTHON_CAN]
+    peers = [share for share in outcomes if share.name == PYTHON_CAN]
     if peers:
-        ours = sum(each.lost for each in found if "socketcand" in each.name)
+        ours = sum(share.lost for share in outcomes if "socketcand" in share.name)
         peer = f"{versions('python-can')} Logger, BLF, on the same load"
-        theirs = sum(each.lost for each in peers)
+        theirs = sum(share.lost for share in peers)
         what = "contention, socketcand: accepted frames lost"
         good.append(verdict(what, ours, theirs, "frames", peer=peer))
     return all(good)
@@ -293,8 +293,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="on the disk to be measured")
     args = parser.parse_args()
     print(HEAD, flush=True)
-    found = measure(args.seconds, runs=args.runs, only=args.only, folder=args.folder)
-    sys.exit(not judge(found))
+    shares = measure(args.seconds, runs=args.runs, only=args.only, folder=args.folder)
+    sys.exit(not judge(shares))
 
 
 if __name__ == "__main__":

@@ -148,14 +148,14 @@ def compare(payloads: list[bytes], runs: int, folder: Path | None) -> None:
     """Print the cost of each way."""
     kinds = measure, processor_time
     works = [partial(run_in, folder, way, kind, payloads) for way in WAYS for kind in kinds]
-    found = in_turn(runs, *works)
-    took, own = (dict(zip(WAYS, found[k::2], strict=True)) for k in range(2))
-    means = {way: float(np.median(found)) for way, found in own.items()}
+    results = in_turn(runs, *works)
+    took, processor_us = (dict(zip(WAYS, results[k::2], strict=True)) for k in range(2))
+    means = {way: float(np.median(times)) for way, times in processor_us.items()}
     peer = f"{versions('mcap')} Writer"
     what = f"keep a message of {len(payloads[0])} B, recorder's sink"
-    compared(what, own["DurableSink"], own["mcap.Writer"], peer, unit="us")
-    for way, found in took.items():
-        every = np.concatenate(found) / 1e3
+    compared(what, processor_us["DurableSink"], processor_us["mcap.Writer"], peer, unit="us")
+    for way, results in took.items():
+        every = np.concatenate(results) / 1e3
         p50, p999, worst = np.percentile(every, (50, 99.9, 100))
         print(
             f"  {way:<18} processor {means[way]:6.2f} "

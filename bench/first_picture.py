@@ -114,9 +114,9 @@ def of_command(session: Path) -> tuple[float, float, float]:
     try:
         assert process.stdout is not None
         had_s, whole_s = look(process.stdout.readline().strip(), start)
-        said = process.stdout.readline()
-        if "all of it" not in said:
-            sys.exit(f"undulog view ended early: {said}")
+        line = process.stdout.readline()
+        if "all of it" not in line:
+            sys.exit(f"undulog view ended early: {line}")
         return had_s, whole_s, time.monotonic() - start
     finally:
         process.terminate()

@@ -61,7 +61,7 @@ def _tables(runs: list[Rows], days: np.ndarray) -> tuple[pd.DataFrame, pd.DataFr
         facts = {"path": f"run{k:02d}", "status": "analysed", "robot": "chain", "duration_s": 5.0}
         start = FIRST + pd.Timedelta(days=float(day))
         sessions.append({**analysis, **facts, "start": start, "changes": None})
-        joints.extend({**one, "path": facts["path"]} for one in of_joints)
+        joints.extend({**row, "path": facts["path"]} for row in of_joints)
     return pd.DataFrame(sessions), pd.DataFrame(joints)
 
 
@@ -105,20 +105,20 @@ def simulate(seed: int, wear: float, engine: str) -> Fleet:
     days = np.sort(rng.uniform(0, DAYS, SESSIONS))
     at, worn = int(rng.integers(10, SESSIONS - 10)), f"joint{rng.integers(JOINTS) + 1:02d}"
     strength = STALL * (1 + 0.05 * rng.normal(size=JOINTS))
-    own = {f"servo_of.joint{j + 1:02d}.stall_torque": float(s) for j, s in enumerate(strength)}
+    torques = {f"servo_of.joint{j + 1:02d}.stall_torque": float(s) for j, s in enumerate(strength)}
     key = f"servo_of.{worn}.stall_torque"
     sound, aged = list[Rows](), list[Rows]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _write(folder)
         for k in range(SESSIONS):
-            changes = own | {
+            changes = torques | {
                 "engine": engine,
                 "gait.horizontal.amplitude": float(rng.choice(GAITS)),
                 "world.ground.mu_normal": float(0.5 * (1 + 0.1 * rng.normal())),
             }
             sound.append(_run(folder, changes, seed * 1000 + k))
-            weaker = changes | {key: own[key] * (1 - wear)}
+            weaker = changes | {key: torques[key] * (1 - wear)}
             aged.append(sound[-1] if k < at else _run(folder, weaker, seed * 1000 + k))
     return Fleet(days, at, worn, sound, aged)
 
@@ -134,16 +134,20 @@ def judge(fleet: Fleet) -> tuple[bool, str, bool]:
         FIRST + pd.Timedelta(days=float(fleet.days[k])) for k in (fleet.at - 1, fleet.at)
     )
     robots = analyse_fleet(*_tables(fleet.aged, fleet.days)).robots
-    first = next((one for robot in robots for one in robot.changes), None)
+    first = next((change for robot in robots for change in robot.changes), None)
     within = (
         first is not None
         and first.joint == fleet.worn
         and pd.Timestamp(first.earliest) <= begun
         and pd.Timestamp(first.latest) >= before
     )
-    found = "nothing" if first is None else f"{first.joint} {first.quantity} since {first.date}"
+    reported = "nothing" if first is None else f"{first.joint} {first.quantity} since {first.date}"
     robots = analyse_fleet(*_tables(fleet.sound, fleet.days)).robots
-    return within, f"{fleet.worn} since {begun:%F}: {found}", any(one.changes for one in robots)
+    return (
+        within,
+        f"{fleet.worn} since {begun:%F}: {reported}",
+        any(robot.changes for robot in robots),
+    )
 
 
 def _judged(seed: int, wear: float, engine: str) -> tuple[bool, str, bool]:

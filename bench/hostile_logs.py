@@ -118,9 +118,9 @@ class HostileLog:
         Returns:
             Where the compressed bytes begin in the file.
         """
-        plain, found = bytearray(), dict[int, list[tuple[int, int]]]()
+        plain, offsets = bytearray(), dict[int, list[tuple[int, int]]]()
         for channel, t_ns, message in messages:
-            found.setdefault(channel, []).append((t_ns, len(plain)))
+            offsets.setdefault(channel, []).append((t_ns, len(plain)))
             head = struct.pack("<HIQQ", channel, 0, t_ns, t_ns)
             plain += record(MESSAGE, head + message)
             self.counts[channel] = self.counts.get(channel, 0) + 1
@@ -135,7 +135,7 @@ class HostileLog:
         self.data += packed[:cut]
         length, index_at = len(self.data) - at, len(self.data)
         places = bytearray()
-        for channel, entries in (found if index is None else index).items():
+        for channel, entries in (offsets if index is None else index).items():
             places += struct.pack("<HQ", channel, len(self.data))
             body = struct.pack("<H", channel)
             self.data += record(MESSAGE_INDEX, body + array(np.array(entries, "<u8").tobytes()))

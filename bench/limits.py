@@ -152,12 +152,12 @@ def main() -> int:
                 fill(log, k * count)
                 paths.append(log.write(folder / f"{k}.mcap"))
             for verb, words in VERBS.items():
-                found = [
+                costs = [
                     [cost(_command(words, path, folder)) for path in (small, *paths)]
                     for _ in range(options.runs)
                 ]
-                nothing, once, twice = np.min(np.array(found)[:, :, 0], axis=0).tolist()
-                peak = float(np.max(np.array(found)[:, :, 1]))
+                nothing, once, twice = np.min(np.array(costs)[:, :, 0], axis=0).tolist()
+                peak = float(np.max(np.array(costs)[:, :, 1]))
                 judged = twice >= LEAST_S
                 ratio = (twice - nothing) / max(once - nothing, 1e-3)
                 worst = max(worst, ratio if judged else 0.0)

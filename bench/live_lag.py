@@ -97,7 +97,9 @@ def read(path: Path) -> tuple[list[Description], list[Message], int]:
             (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
             for _, _, m in reader.iter_messages()
         ]
-    (epoch_ns,) = [one.metadata["epoch_ns"] for one in facts if one.name == "undulog"]
+    (epoch_ns,) = [
+        metadata.metadata["epoch_ns"] for metadata in facts if metadata.name == "undulog"
+    ]
     return definitions, messages, int(epoch_ns)
 
 
@@ -146,8 +148,8 @@ def measure(session: Path, folder: Path, size: str) -> Watch:
         stack.callback(feed.close)
         client = client_of(address)
         definitions, messages, epoch_ns = read(session)
-        for one in definitions:
-            feed.define(one)
+        for definition in definitions:
+            feed.define(definition)
         connect(feed)
         start_ns = time.monotonic_ns() + 200_000_000
         watch = Watch(client, start_ns)

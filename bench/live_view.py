@@ -112,8 +112,8 @@ def measure_hot(feed: LiveFeed, count: int = 200_000) -> None:
     begun = time.perf_counter_ns()
     for _ in range(count):
         feed.offer(*message)
-    each = (time.perf_counter_ns() - begun) / count / 1e3
-    print(f"{'nobody watches, tight loop':28s} {each:6.2f} us an offer")
+    offer_us = (time.perf_counter_ns() - begun) / count / 1e3
+    print(f"{'nobody watches, tight loop':28s} {offer_us:6.2f} us an offer")
 
 
 def relay(stack: ExitStack, path: Path, *options: object) -> subprocess.Popen[str]:
@@ -136,11 +136,11 @@ def start_viewer(stack: ExitStack, *options: object) -> tuple[subprocess.Popen[s
 def connect(feed: LiveFeed) -> None:
     """Wait until the feed has found its relay."""
 
-    def found() -> bool:
+    def connected() -> bool:
         feed.pump()
         return feed.connected
 
-    wait_for(found)
+    wait_for(connected)
 
 
 def main() -> None:

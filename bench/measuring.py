@@ -152,13 +152,13 @@ def hour_of(
 
 def chain(robot: Robot, joints: int) -> Robot:
     """Return a robot of another length, of the same modules, without sensors."""
-    last, (one, other) = robot.links[-1], robot.joints[:2]
+    last, (even, other) = robot.links[-1], robot.joints[:2]
     return dataclasses.replace(
         robot,
         name=f"chain{joints}",
         links=tuple(dataclasses.replace(last, name=f"link{k}") for k in range(joints + 1)),
         joints=tuple(
-            dataclasses.replace(other if k % 2 else one, name=f"joint{k}") for k in range(joints)
+            dataclasses.replace(other if k % 2 else even, name=f"joint{k}") for k in range(joints)
         ),
         sensors=(),
         bus=None,

@@ -128,9 +128,9 @@ def message_times(
         read = decode(path, topics, window)
 
     works = [*(partial(ours, number) for number in threads), peer]
-    *each, theirs = in_turn(runs, *(partial(took, work) for work in works))
-    ours_us = [[1e6 * one.wall_s / count for one in turns] for turns in each]
-    return ours_us, [1e6 * one.wall_s / read for one in theirs]
+    *by_threads, theirs = in_turn(runs, *(partial(took, work) for work in works))
+    ours_us = [[1e6 * cost.wall_s / count for cost in turns] for turns in by_threads]
+    return ours_us, [1e6 * cost.wall_s / read for cost in theirs]
 
 
 def decode(path: Path, topics: Sequence[str], window: tuple[int, int]) -> int:
@@ -145,15 +145,15 @@ def decode(path: Path, topics: Sequence[str], window: tuple[int, int]) -> int:
 
 def window_ms(path: Path, start_s: int, threads: int) -> tuple[float, float]:
     """Return wall-clock times of the first and later windows of ten seconds [ms]."""
-    found: list[float] = []
+    times: list[float] = []
     fields = {"/joint_states": ["position", "velocity", "effort"]}
     with Session.open(path, threads=threads) as session:
         for k in range(LATER_WINDOWS + 1):
             start_ns = EPOCH_NS + (start_s + 11 * k) * 10**9
             window = {"start_ns": start_ns, "stop_ns": start_ns + 10 * 10**9}
             read = partial(session.joint_columns, fields, **window)
-            found.append(took(read).wall_s * 1e3)
-    return found[0], statistics.median(found[1:])
+            times.append(took(read).wall_s * 1e3)
+    return times[0], statistics.median(times[1:])
 
 
 def loading_memory(path: Path) -> dict[str, int]:
@@ -171,19 +171,19 @@ def loading_memory(path: Path) -> dict[str, int]:
 
     watcher = threading.Thread(target=watch)
     watcher.start()
-    found = load(path, None)
+    loaded = load(path, None)
     done.set()
     watcher.join()
-    arrays = sum(_sizes(found).values())
+    arrays = sum(_sizes(loaded).values())
     return {"arrays": arrays, "over": max(peak, memory("RssAnon")) - before - arrays}
 
 
-def _sizes(found: Loaded) -> dict[int, int]:
+def _sizes(loaded: Loaded) -> dict[int, int]:
     """Return memory of the arrays that were loaded, each counted once, by address."""
-    joints, tables = found
-    arrays = [array for one in joints.values() for array in (*one.t_ns, *one.values)]
+    joints, tables = loaded
+    arrays = [array for series in joints.values() for array in (*series.t_ns, *series.values)]
     for table in tables.values():
-        arrays += [one.to_numpy() for one in (table.index, *(table[name] for name in table))]
+        arrays += [column.to_numpy() for column in (table.index, *(table[name] for name in table))]
     return {array.ctypes.data: array.nbytes for array in arrays}
 
 

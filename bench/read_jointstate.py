@@ -70,8 +70,8 @@ def read_ours(
 ) -> dict[str, FloatArray]:
     """Return all columns through the session reader."""
     with Session.open(path, threads=threads) as session:
-        found = session.joint_columns(topics)
-    return {f"{topic}.{field}": np.array(found[topic, field].values) for topic, field in found}
+        columns = session.joint_columns(topics)
+    return {f"{topic}.{field}": np.array(columns[topic, field].values) for topic, field in columns}
 
 
 def read_peer(path: Path) -> dict[str, FloatArray]:
@@ -99,7 +99,7 @@ def main() -> None:
     }
     of_one_topic = partial(read_ours, threads=1, topics={ONE_TOPIC: TOPICS[ONE_TOPIC]})
     took: dict[str, list[float]] = defaultdict(list)
-    known: dict[str, str] = {}
+    library_versions: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
         count = write_session(path, options.minutes)
@@ -107,12 +107,12 @@ def main() -> None:
             f"{count} JointState messages, {len(NAMES)} joints, {path.stat().st_size / 1e6:.0f} MB"
         )
         for _ in range(options.runs):  # in turn, so that a drift of the machine hits all
-            found: list[dict[str, FloatArray]] = []
+            read_by_all: list[dict[str, FloatArray]] = []
             for name, read in readers.items():
                 used, columns = timed(partial(read, path))
                 took[name].append(used.wall_s)
-                found.append(columns)
-            *ours, theirs = found
+                read_by_all.append(columns)
+            *ours, theirs = read_by_all
             for mine in ours:
                 for name, values in mine.items():
                     np.testing.assert_array_equal(values, theirs[name])
@@ -121,14 +121,14 @@ def main() -> None:
                     assert read_by["messages"] == count // len(TOPICS), read_by
                     took[library].append(read_by["seconds"])
                     took[ours_to(library)].append(timed(partial(of_one_topic, path))[0].wall_s)
-                    known[library] = read_by["version"]
+                    library_versions[library] = read_by["version"]
     what = "read all joint columns"
     for way, bar in ((f"{threads} threads", BAR), ("1 thread", None)):
         compared(f"{what}, {way}", took[way], took[peer], peer, bar=bar)
     what = f"read the columns of {ONE_TOPIC}, 1 thread"
     for library in READERS:
-        if library in known:
-            compared(what, took[ours_to(library)], took[library], known[library])
+        if library in library_versions:
+            compared(what, took[ours_to(library)], took[library], library_versions[library])
         else:
             not_run(f"{what}, against {library}", f"{PYTHON} names no interpreter that has it")
 

@@ -94,10 +94,10 @@ def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.P
     outcome.cpu = (cpu_s(pid) - used) / (time.monotonic() - begun)
     for sender in senders:
         text, _ = sender.communicate(timeout=60)
-        said = json.loads(text.splitlines()[-1])
-        outcome.offered += said["offered"]
-        outcome.late += said["late"]
-        outcome.worst_behind_ms = max(outcome.worst_behind_ms, said["worst_behind_ms"])
+        report = json.loads(text.splitlines()[-1])
+        outcome.offered += report["offered"]
+        outcome.late += report["late"]
+        outcome.worst_behind_ms = max(outcome.worst_behind_ms, report["worst_behind_ms"])
     time.sleep(1.0)  # what is buffered is taken
 
 
@@ -207,7 +207,7 @@ def main() -> None:
     growth = ours.rss_mb[-1] - ours.rss_mb[len(ours.rss_mb) // 3]
     more_ms = (frozen.tick_p99_ms or 0) - (ours.tick_p99_ms or 0)
     good = [
-        *(verdict(f"{one.name}: frames lost", one.lost, 0, "frames") for one in outcomes[:5]),
+        *(verdict(f"{case.name}: frames lost", case.lost, 0, "frames") for case in outcomes[:5]),
         verdict(f"{ours.name}: memory growth in the last two thirds", growth, 5, "MB"),
         verdict("frozen viewer: more at the 99th percentile of the tick", more_ms, 0.5, "ms"),
         *(
@@ -223,8 +223,8 @@ def main() -> None:
     ]  # fmt: skip
     for other in peers:
         verdict(f"{other.name}: frames lost", other.lost, None, "frames")
-    for one in outcomes:
-        verdict(f"{one.name}: frames that the sender sent late", one.late, None, "frames")
+    for outcome in outcomes:
+        verdict(f"{outcome.name}: frames that the sender sent late", outcome.late, None, "frames")
     if options.contended:
         print(f"\nbeside two busy loops a core and dd with fsync\n{contention.HEAD}", flush=True)
         good.append(contention.judge(contention.measure(options.contended, runs=3)))

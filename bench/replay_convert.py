@@ -118,8 +118,10 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> Figures:
     with Session.open(path) as session:
         start_ns = session.start_ns
         stop_ns = start_ns + round(seconds * 1e9)
-        wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != "/gait"}
-        columns = read_columns(session, wanted, start_ns=start_ns, stop_ns=stop_ns)
+        columns_of = {
+            topic: names for topic, names in wanted_fields(session).items() if topic != "/gait"
+        }
+        columns = read_columns(session, columns_of, start_ns=start_ns, stop_ns=stop_ns)
         robot = session.robot
         assert robot is not None
         measured = columns["/joint_states", "position"]
@@ -181,20 +183,20 @@ def measure(path: Path, minutes: float, runs: int, pairs: int, rows_s: float) ->
     )
     rerun = versions("rerun-sdk")
     by_row = f"{rerun}, a log call for each sample (scaled from {rows_s:g} s)"
-    own = f"{rerun} mcap convert of the MCAP, nothing derived"
-    rows_cpu = [one.processor_s for one in rows]
+    peer = f"{rerun} mcap convert of the MCAP, nothing derived"
+    rows_cpu = [row.processor_s for row in rows]
     good = list[bool]()
     for what, costs in (("MCAP to .rrd", ours), ("view --save, which analyses", commands)):
-        cpu = [one.processor_s for one in costs]
+        cpu = [figures.processor_s for figures in costs]
         good.append(compared(what, cpu, rows_cpu, by_row, bar=COST, scale=scale))
-        compared(what, cpu, itself, own)
-        peak_mb = max(one.peak_mb for one in costs)
+        compared(what, cpu, itself, peer)
+        peak_mb = max(figures.peak_mb for figures in costs)
         good.append(verdict(f"{what}, peak memory", peak_mb, PEAK_MB, "MB"))
     with one_core():
         spent = in_turn(pairs, lambda: command().processor_s, lambda: conversion().processor_s)
     what, alone = "view --save, which analyses, on one core", "the conversion alone"
     good.append(compared(what, *spent, alone, bar=WITH_ANALYSIS))
-    verdict("MCAP to .rrd, wall-clock time", min(one.wall_s for one in ours), None, "s")
+    verdict("MCAP to .rrd, wall-clock time", min(figures.wall_s for figures in ours), None, "s")
     sizes = [ours[0].size_mb], [rows[0].size_mb]
     good.append(compared(".rrd, size", *sizes, by_row, bar=SIZE, unit="MB", scale=scale))
     recording.unlink()

@@ -93,8 +93,8 @@ def convert_both(folder: Path, minutes: float) -> list[Converted]:
         sessions = [stack.enter_context(Session.open(log)) for log in logs]
         sides = [read_side(session, session.path.stem) for session in sessions]
         return [
-            Converted(one, *convert(session, session.path.with_suffix(".rrd")))
-            for one, session in zip(align(sides, Align.PHASE), sessions, strict=True)
+            Converted(side, *convert(session, session.path.with_suffix(".rrd")))
+            for side, session in zip(align(sides, Align.PHASE), sessions, strict=True)
         ]
 
 
@@ -103,7 +103,7 @@ def main(minutes: float) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         converted = convert_both(folder, minutes)
-        recordings = [one.recording.path for one in converted]
+        recordings = [session.recording.path for session in converted]
         sizes = " and ".join(f"{path.stat().st_size / 1e6:.0f}" for path in recordings)
         count = rows(recordings)
         print(f"two sessions of {minutes:g} min, {sizes} MB of .rrd, {count} rows in all")
@@ -112,13 +112,13 @@ def main(minutes: float) -> None:
         def merge() -> None:
             write(target, lambda rec: send(rec, streams(recordings)))
 
-        own = folder / "own.rrd"
-        command = [viewer_binary(), "rrd", "merge", *recordings, "-o", own]
+        rerun_merged = folder / "own.rrd"
+        command = [viewer_binary(), "rrd", "merge", *recordings, "-o", rerun_merged]
         merge_by_rerun = partial(subprocess.run, command, check=True, capture_output=True)
         ours, theirs = in_turn(
             3,
             partial(timed, "merge", merge, target),
-            partial(timed, "rerun rrd merge", merge_by_rerun, own),
+            partial(timed, "rerun rrd merge", merge_by_rerun, rerun_merged),
         )
         subprocess.run([viewer_binary(), "rrd", "verify", target], check=True, capture_output=True)
         overlay = partial(write_overlay, converted, target, Align.PHASE)

@@ -61,9 +61,9 @@ class Memory:
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """Return the next bytes."""
-        found = self._data[self.at : self.at + length]
-        self.at += len(found)
-        return found
+        chunk = self._data[self.at : self.at + length]
+        self.at += len(chunk)
+        return chunk
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
         """Whether no more will come."""
@@ -72,35 +72,35 @@ class Memory:
 
 def stream(protocol: str, packets: int) -> list[bytes]:
     """Return requests and replies in turn."""
-    found: list[bytes] = []
+    traffic: list[bytes] = []
     draw = np.random.default_rng(1)
     for k in range(packets // 2):
         servo, data = SERVOS[k % 12], draw.integers(0, 120, 21, np.uint8).tobytes()
         if protocol == "feetech":
-            found.append(feetech_packet(servo, 2, bytes((56, 15))))
-            found.append(feetech_packet(servo, 0, data[:15]))
+            traffic.append(feetech_packet(servo, 2, bytes((56, 15))))
+            traffic.append(feetech_packet(servo, 0, data[:15]))
         else:
-            found.append(dynamixel_packet(servo, 2, bytes((126, 0, 21, 0))))
-            found.append(dynamixel_packet(servo, 0x55, bytes(1) + data))
-    return found
+            traffic.append(dynamixel_packet(servo, 2, bytes((126, 0, 21, 0))))
+            traffic.append(dynamixel_packet(servo, 0x55, bytes(1) + data))
+    return traffic
 
 
 def sdk_s(protocol: str, data: bytes, count: int) -> float:
     """Return the processor time of the SDK's parser [s]."""
     port = Memory(data)
     begun = time.process_time()
-    found = 0
+    parsed = 0
     if protocol == "feetech":
         sdk = PacketHandler(0)
         while port.at < len(data):
-            found += sdk.rxPacket(port)[1] == 0
+            parsed += sdk.rxPacket(port)[1] == 0
     else:
         handler = Protocol2PacketHandler()
         while port.at < len(data):
-            found += handler.rxPacket(port, False)[1] == 0
+            parsed += handler.rxPacket(port, False)[1] == 0
     took = time.process_time() - begun
     # Dynamixel's parser looks at the bytes of requests, too, and passes over them.
-    assert found == (count if protocol == "feetech" else count // 2), (found, count)
+    assert parsed == (count if protocol == "feetech" else count // 2), (parsed, count)
     return took
 
 
@@ -117,7 +117,7 @@ def our_s(protocol: str, data: bytes, count: int) -> tuple[float, float]:
     for at in range(0, len(parts), 64):
         block = np.concatenate(parts[at : at + 64])
         records += len(block)
-        values += sum(len(one.values) for one in decoder.decode(block)[0])
+        values += sum(len(record.values) for record in decoder.decode(block)[0])
     decoded = time.process_time()
     assert records == count
     assert values == count // 2 * 5, values  # position, velocity, voltage, temperature, current
@@ -151,14 +151,14 @@ def delays_s(packets: list[bytes]) -> np.ndarray[tuple[int], np.dtype[np.float64
                 for array in source.poll().fd_frames:
                     stamps += array["t_host_ns"].tolist()
                 time.sleep(0.005)
-            told = b""
-            while len(told) < 8 * len(packets):
-                told += os.read(sent, 1 << 16)
+            sent_times = b""
+            while len(sent_times) < 8 * len(packets):
+                sent_times += os.read(sent, 1 << 16)
             os.waitpid(sender, 0)
             source.stop()
         os.close(master)
         os.close(slave)
-    return (np.array(stamps) - np.frombuffer(told, np.int64)) * 1e-9
+    return (np.array(stamps) - np.frombuffer(sent_times, np.int64)) * 1e-9
 
 
 def main() -> None:

@@ -180,7 +180,7 @@ def compiled(folder: Path) -> Path:
         text=True,
     )
     took_s = json.loads(done.stdout)
-    assert all(each >= 0.14 for each in took_s), f"the slow disk is not in effect: {took_s}"
+    assert all(duration >= 0.14 for duration in took_s), f"the slow disk is not in effect: {took_s}"
     return library
 
 
@@ -209,11 +209,11 @@ def run(folder: Path, load: float, seconds: float, before: Sequence[str]) -> Out
             os.sched_setaffinity(sender.pid, {CORES["senders"]})
         accepted = 0
         for sender in senders:
-            said = json.loads(sender.communicate(timeout=seconds + 60)[0].splitlines()[-1])
-            outcome.offered += said["offered"]
-            outcome.refused += said["offered"] - said["accepted"]
-            outcome.late += said["late"]
-            accepted += said["accepted"]
+            sent = json.loads(sender.communicate(timeout=seconds + 60)[0].splitlines()[-1])
+            outcome.offered += sent["offered"]
+            outcome.refused += sent["offered"] - sent["accepted"]
+            outcome.late += sent["late"]
+            accepted += sent["accepted"]
         used = cpu_s(pid) - used
         outcome.share = used / (time.monotonic() - begun)
         outcome.cpu_us = used / accepted * 1e6
@@ -238,7 +238,7 @@ def _written(pid: int) -> int:
 def judge(outcomes: Sequence[Outcome], seconds: float, where: str) -> bool:
     """Print and keep the figures; return whether the bars are met."""
     base = outcomes[0]
-    held = [one for one in outcomes if one.held]
+    held = [outcome for outcome in outcomes if outcome.held]
     failed = base.refused + base.lost
     load = f"{where}, two buses of 25 joints at {RATE_HZ} Hz"
     good = [
@@ -254,7 +254,7 @@ def judge(outcomes: Sequence[Outcome], seconds: float, where: str) -> bool:
         ("99 % of the loop's ticks", base.tick_p99_ms, "ms"),
     ):
         verdict(f"{load}: {what}", value, None, unit)
-    highest = 2 * max((one.load for one in held), default=0.0)
+    highest = 2 * max((outcome.load for outcome in held), default=0.0)
     what = f"{where}: highest load held for {seconds:g} s without a refused or lost frame"
     good.append(verdict(what, highest, 2 * LOADS[0], "frames/s", most=False))
     return all(good)

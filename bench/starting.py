@@ -52,7 +52,7 @@ def main() -> int:
         ]
         in_turn(1, *starts)  # fills the caches
         took = in_turn(runs, *starts)
-    used = [[each.processor_s for each in turns] for turns in took]
+    used = [[usage.processor_s for usage in turns] for turns in took]
     peer = f"import of {versions('numpy')}"
     good = [
         compared(f"undulog {name}", mine, theirs, peer, bar=HELP if "--help" in name else INFO)

@@ -74,7 +74,7 @@ def main() -> None:
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_plan(folder, joints=5)  # its robot and scenario serve here
-        one, _ = measure(folder, few, 1)
+        single, _ = measure(folder, few, 1)
         two, overhead = measure(folder, runs, 2)
         port = free_port()
         address = f"tcp://127.0.0.1:{port}"
@@ -85,19 +85,19 @@ def main() -> None:
                 dask_two, dask_overhead = measure(folder, runs, 2, address)
         local = comparable(RowStore(_rows(folder, 2, None)).rows())
         same = comparable(RowStore(_rows(folder, 2, address)).rows()) == local
-    print(f"1 process:      {one:.2f} runs/s ({few} runs)")
-    print(f"2 processes:    {two:.2f} runs/s ({runs} runs), {two / one:.2f} times one process")
+    print(f"1 process:      {single:.2f} runs/s ({few} runs)")
+    print(f"2 processes:    {two:.2f} runs/s ({runs} runs), {two / single:.2f} times one process")
     print(f"overhead:       {100 * overhead:.1f} % of the workers' time")
-    print(f"1 Dask worker:  {dask_one:.2f} runs/s, {dask_one / one:.2f} times one process")
+    print(f"1 Dask worker:  {dask_one:.2f} runs/s, {dask_one / single:.2f} times one process")
     print(
         f"2 Dask workers: {dask_two:.2f} runs/s, {dask_two / dask_one:.2f} times one Dask worker, "
-        f"{dask_two / one:.2f} times one process"
+        f"{dask_two / single:.2f} times one process"
     )
     print(f"overhead:       {100 * dask_overhead:.1f} % of the workers' time")
-    verdict("sweep, 2 workers, 5 joints: runs/s to one worker", two / one, None, "times")
+    verdict("sweep, 2 workers, 5 joints: runs/s to one worker", two / single, None, "times")
     verdict("sweep, 2 workers: overhead", 100 * overhead, None, "% of the workers' time")
     what = "the same on a Dask cluster of 2: runs/s to one"
-    verdict(f"{what} local process", dask_two / one, None, "times")
+    verdict(f"{what} local process", dask_two / single, None, "times")
     verdict(f"{what} Dask worker", dask_two / dask_one, None, "times")
     verdict("sweep, rows of both equal", float(same), 1, "", most=False)
     print(f"same rows: {'yes' if same else 'NO'}")

@@ -93,9 +93,9 @@ def main() -> int:
             works = partial(anew, ours, out), partial(anew, peer, out)
             in_turn(1, *works)  # what is imported late is imported now
             turns = in_turn(options.runs, *works)
-            processor = ([each.processor_s for each in side] for side in turns)
+            processor = ([cost.processor_s for cost in side] for side in turns)
             good &= compared(what, *processor, name, bar=BAR)
-            wall = ([each.wall_s for each in side] for side in turns)
+            wall = ([cost.wall_s for cost in side] for side in turns)
             compared(f"{what}, wall time", *wall, name)
     return int(not good)
 

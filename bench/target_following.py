@@ -88,26 +88,27 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     by = {name: {r["seed"]: r for r in results if r["controller"] == name} for name in names}
     seeds = sorted(by[FOLLOW].keys() & by[WALK].keys())
     runs = {name: pd.DataFrame([by[name][seed] for seed in seeds]) for name in names}
-    found: dict[str, Any] = {"seeds": seeds}
-    for name, one in runs.items():
+    result: dict[str, Any] = {"seeds": seeds}
+    for name, table in runs.items():
         keys = ("time_s", "electrical_j", "contact_s", "path_m")
-        found[name] = {"met": int(one["met"].sum())}
-        found[name] |= {key: median_interval(one[key].tolist()) for key in keys}
+        result[name] = {"met": int(table["met"].sum())}
+        result[name] |= {key: median_interval(table[key].tolist()) for key in keys}
     for key in ("time_s", "electrical_j"):
-        found[f"{key}_ratio"] = median_interval((runs[WALK][key] / runs[FOLLOW][key]).tolist())
-    found["contact_share"] = {
-        name: float(sum(one["contact_s"]) / sum(one["time_s"])) for name, one in runs.items()
+        result[f"{key}_ratio"] = median_interval((runs[WALK][key] / runs[FOLLOW][key]).tolist())
+    result["contact_share"] = {
+        name: float(sum(run_table["contact_s"]) / sum(run_table["time_s"]))
+        for name, run_table in runs.items()
     }
-    return found
+    return result
 
 
-def text(found: dict[str, Any], limits_s: dict[str, float]) -> str:
+def text(result: dict[str, Any], limits_s: dict[str, float]) -> str:
     """Return the answer, then the table."""
-    n = len(found["seeds"])
-    faster, less = found["time_s_ratio"], found["electrical_j_ratio"]
-    censored = n - found[WALK]["met"]
+    n = len(result["seeds"])
+    faster, less = result["time_s_ratio"], result["electrical_j_ratio"]
+    censored = n - result[WALK]["met"]
     answer = (
-        f"target following met the target in {found[FOLLOW]['met']} of {n} runs, "
+        f"target following met the target in {result[FOLLOW]['met']} of {n} runs, "
         f"{faster[0]:.1f} times as fast as the random walk (95 % interval {faster[1]:.1f} to "
         f"{faster[2]:.1f}), for 1/{less[0]:.1f} of its electrical energy (1/{less[1]:.1f} to "
         f"1/{less[2]:.1f}): medians of paired ratios"
@@ -115,12 +116,12 @@ def text(found: dict[str, Any], limits_s: dict[str, float]) -> str:
     heads = [f"{head:>22}" for head in ("time s", "electrical J", "contact s")]
     lines = [answer, f"{'':18} {'met':>7} {' '.join(heads)} {'share in contact':>17}"]
     for name in (FOLLOW, WALK):
-        row = found[name]
+        row = result[name]
         cells = [
             f"{row[key][0]:8.1f} ({row[key][1]:.1f} to {row[key][2]:.1f})".rjust(22)
             for key in ("time_s", "electrical_j", "contact_s")
         ]
-        share = f"{100 * found['contact_share'][name]:.1f} %"
+        share = f"{100 * result['contact_share'][name]:.1f} %"
         lines.append(f"{name:18} {row['met']:3}/{n:3} {' '.join(cells)} {share:>17}")
     lines.append(
         f"medians with 95 % intervals of the sign test, over {n} seeds; {censored} random walks "
@@ -136,8 +137,8 @@ def study(
     """Run what the output file does not hold yet, keeping it up to date."""
     stored = output is not None and output.exists()
     results = json.loads(output.read_text())["runs"] if stored else []
-    wanted = [(name, seed) for name in limits_s for seed in seeds]
-    ids = {(name, seed): load_scenario(name).changed(seed=seed).session_id for name, seed in wanted}
+    cases = [(name, seed) for name in limits_s for seed in seeds]
+    ids = {(name, seed): load_scenario(name).changed(seed=seed).session_id for name, seed in cases}
     results = [
         r
         for r in results
@@ -145,7 +146,7 @@ def study(
         and (r["met"] or r["limit_s"] >= limits_s[r["controller"]])
     ]
     held = {(r["controller"], r["seed"]) for r in results}
-    left = [one for one in wanted if one not in held]
+    left = [case for case in cases if case not in held]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         runs = [pool.submit(run, name, seed, limits_s[name], kernels) for name, seed in left]
         for done in as_completed(runs):
@@ -167,11 +168,11 @@ def main() -> None:
     seeds = list(range(int(first), int(last or first) + 1))
     limits_s = {FOLLOW: options.follow_limit, WALK: options.walk_limit}
     results = study(seeds, limits_s, options.jobs, options.kernels, options.output)
-    found = summary(results)
-    kept = {"summary": found, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
+    result = summary(results)
+    kept = {"summary": result, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
     options.output.write_text(json.dumps(kept, indent=1) + "\n")
-    print(text(found, limits_s))
-    met, (ratio, low, high) = found[FOLLOW]["met"] / len(seeds), found["time_s_ratio"]
+    print(text(result, limits_s))
+    met, (ratio, low, high) = result[FOLLOW]["met"] / len(seeds), result["time_s_ratio"]
     verdict("target following: targets met", 100 * met, 90, "%", most=False)
     what = f"target following: random walk's time over its own ({low:.3g} to {high:.3g})"
     verdict(what, ratio, None, "times", peer="random walk")

@@ -125,8 +125,8 @@ def built_in_body(robot: Robot, client: int) -> int:
 
 def turns(ways: Mapping[_Way, Callable[[], float]], runs: int) -> dict[_Way, list[float]]:
     """Return microseconds a step of each way, turn by turn."""
-    found = in_turn(runs, *ways.values())
-    return {name: [1e6 * s for s in each] for name, each in zip(ways, found, strict=True)}
+    costs = in_turn(runs, *ways.values())
+    return {name: [1e6 * s for s in step_s] for name, step_s in zip(ways, costs, strict=True)}
 
 
 def without_sensors(scenario: Scenario) -> Scenario:
@@ -142,7 +142,7 @@ def main() -> None:
     flat = without_sensors(whole)
     mujoco = dataclasses.replace(flat, engine=EngineKind.MUJOCO)
     step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
-    found = turns(
+    costs_us = turns(
         {
             f"{name}{more}": partial(step_twin, scenario, kernels)
             for more, scenario in (("", flat), (", MuJoCo", mujoco), (", all sensors", whole))
@@ -151,18 +151,18 @@ def main() -> None:
         | {BUILT_IN: partial(step_builtin, flat)},
         options.runs,
     )
-    each = {name: min(costs) for name, costs in found.items()}
-    theirs = each[BUILT_IN]
+    cheapest = {name: min(costs) for name, costs in costs_us.items()}
+    theirs = cheapest[BUILT_IN]
     peer = f"{versions('pybullet')}, its contacts and motors"
     for name in (NUMPY, NUMBA):
         what = f"step of 25 joints, {name}"
-        compared(what, found[name], found[BUILT_IN], peer, unit="us")
+        compared(what, costs_us[name], costs_us[BUILT_IN], peer, unit="us")
     print(
-        f"25 joints at 1 kHz: {1e3 / each[NUMPY]:.1f} x real time with NumPy and "
-        f"{1e3 / each[NUMBA]:.1f} x with numba; a step {theirs / each[NUMPY]:.1f} and "
-        f"{theirs / each[NUMBA]:.1f} times as cheap as PyBullet's own contacts and motors"
+        f"25 joints at 1 kHz: {1e3 / cheapest[NUMPY]:.1f} x real time with NumPy and "
+        f"{1e3 / cheapest[NUMBA]:.1f} x with numba; a step {theirs / cheapest[NUMPY]:.1f} and "
+        f"{theirs / cheapest[NUMBA]:.1f} times as cheap as PyBullet's own contacts and motors"
     )
-    for name, step_us in each.items():
+    for name, step_us in cheapest.items():
         print(f"{name:<27} {step_us:7.0f} us a step  {1e3 / step_us:5.1f} x real time")
     print(f"\n{'us a step, by joints':<27}" + "".join(f"{n:>9}" for n in LENGTHS))
     rows: dict[str, list[float]] = {NUMPY: [], NUMBA: [], BUILT_IN: []}
