@@ -124,10 +124,10 @@ def find_python(version: str) -> Path:
     ask = "import sys; print('%d.%d' % sys.version_info[:2], sys.executable)"
     for name in filter(None, names):
         try:
-            found, path = run(name, "-c", ask).split(maxsplit=1)
+            actual, path = run(name, "-c", ask).split(maxsplit=1)
         except (FailedError, OSError, ValueError):
             continue
-        if found == version:
+        if actual == version:
             return Path(path.strip())
     raise NotTriedError(f"no Python {version} on this machine")
 
@@ -268,7 +268,7 @@ class Paths:
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         lines = project["optional-dependencies"][extra] if extra else project["dependencies"]
         # PyBullet has no such wheel: MuJoCo takes its place there.
-        wanted = [line.partition(";")[0] for line in lines if "pybullet" not in line]
+        requirements = [line.partition(";")[0] for line in lines if "pybullet" not in line]
         platforms = (
             f"--platform={name}_aarch64"
             for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014")
@@ -276,7 +276,7 @@ class Paths:
         folder = self.work / f"aarch64-{extra}"
         pip = self.environment("build") / "pip"
         options = ("--quiet", "--only-binary=:all:", "--python-version=3.11", *platforms)
-        run(pip, "download", *options, "-d", folder, *wanted)
+        run(pip, "download", *options, "-d", folder, *requirements)
         names = [path.name for path in folder.iterdir()]
         native = [name for name in names if "aarch64" in name]
         return f"{len(names)} wheels, {len(native)} of them for aarch64"
@@ -326,8 +326,8 @@ def _hand_on_network(root: Path) -> None:
 def _mirror() -> list[str]:
     """Return the mirror that this Debian uses, if it says."""
     for path in Path("/etc/apt/sources.list.d").glob("*.sources"):
-        if found := re.search(r"^URIs: *(\S+)", path.read_text(), re.MULTILINE):
-            return [found[1]]
+        if match := re.search(r"^URIs: *(\S+)", path.read_text(), re.MULTILINE):
+            return [match[1]]
     return []
 
 
@@ -349,13 +349,13 @@ def main(words: list[str]) -> int:
                 continue
             start = time.monotonic()
             try:
-                verdict, found = "ok", step()
+                verdict, note = "ok", step()
             except NotTriedError as why:
-                verdict, found = "not tried", str(why)
+                verdict, note = "not tried", str(why)
             except (FailedError, OSError, subprocess.TimeoutExpired, ValueError) as error:
-                verdict, found, failed = "failed", str(error), 1
+                verdict, note, failed = "failed", str(error), 1
             spent = time.monotonic() - start
-            print(f"{verdict:<9}  {name}: {found} ({spent:.0f} s)", flush=True)  # noqa: T201
+            print(f"{verdict:<9}  {name}: {note} ({spent:.0f} s)", flush=True)  # noqa: T201
     return failed
 
 

@@ -157,14 +157,16 @@ def main() -> int:
     FOLDER.mkdir(parents=True, exist_ok=True)
     state, this = FOLDER / "outcomes.json", commit()
     kept = json.loads(state.read_text()) if state.exists() else {}
-    outcomes = {name: Outcome(**one) for name, one in kept.get(this, {}).items()}
+    outcomes = {name: Outcome(**fields) for name, fields in kept.get(this, {}).items()}
     try:
         for name in chosen:
             if name in outcomes and outcomes[name].state == "passed":
                 continue
             print(f"{time.strftime('%H:%M')} {name}: {PARTS[name].command}", flush=True)  # noqa: T201
             outcomes[name] = run(name, outcomes.get(name), this)
-            state.write_text(json.dumps({this: {k: asdict(one) for k, one in outcomes.items()}}))
+            state.write_text(
+                json.dumps({this: {k: asdict(outcome) for k, outcome in outcomes.items()}})
+            )
     except KeyboardInterrupt:
         print("interrupted")  # noqa: T201
     print(f"{this}:", *table(outcomes), sep="\n")  # noqa: T201

@@ -91,11 +91,13 @@ def faults(lock: Path) -> str:
         packages = json.loads(done.stdout)["dependencies"]
     except (subprocess.TimeoutExpired, json.JSONDecodeError):
         return "not checked: no service reachable"
-    known = [one for one in packages if "skip_reason" not in one]
-    if not known:
+    checked = [package for package in packages if "skip_reason" not in package]
+    if not checked:
         return "not checked: no service knows the packages"
-    found = [f"{one['name']} {v['id']}" for one in known for v in one["vulns"]]
-    return f"{', '.join(found) or 'none'} ({len(known)} of {len(packages)} checked)"
+    vulnerabilities = [
+        f"{package['name']} {v['id']}" for package in checked for v in package["vulns"]
+    ]
+    return f"{', '.join(vulnerabilities) or 'none'} ({len(checked)} of {len(packages)} checked)"
 
 
 def release(output: Path) -> list[str]:

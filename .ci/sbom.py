@@ -81,17 +81,17 @@ def scopes(packages: Iterable[Locked], project: Mapping[str, Any]) -> dict[str, 
         for parent in package.needed_by:
             needs.setdefault(canonicalize_name(parent), set()).add(package.name)
     extras = [line for lines in project["optional-dependencies"].values() for line in lines]
-    found: dict[str, str] = {package.name: "excluded" for package in packages}
+    scope_of: dict[str, str] = {package.name: "excluded" for package in packages}
     for scope, lines in (("optional", extras), ("required", project["dependencies"])):
         waiting = [canonicalize_name(Requirement(line).name) for line in lines]
         seen: set[str] = set()
         while waiting:
             name = waiting.pop()
-            if name in found and name not in seen:
+            if name in scope_of and name not in seen:
                 seen.add(name)
-                found[name] = scope
+                scope_of[name] = scope
                 waiting += needs.get(name, ())
-    return found
+    return scope_of
 
 
 def bill(lock: str, project: Mapping[str, Any], time_s: int) -> dict[str, Any]:
@@ -102,9 +102,9 @@ def bill(lock: str, project: Mapping[str, Any], time_s: int) -> dict[str, Any]:
         project: Table ``project`` of ``pyproject.toml``.
         time_s: Unix time of the release [s].
     """
-    packages = sorted(read_lock(lock), key=lambda one: (one.name, one.version))
+    packages = sorted(read_lock(lock), key=lambda package: (package.name, package.version))
     scope_of = scopes(packages, project)
-    own = f"pkg:pypi/{project['name']}@{project['version']}"
+    purl = f"pkg:pypi/{project['name']}@{project['version']}"
     direct = [*project["dependencies"]]
     direct += [line for lines in project["optional-dependencies"].values() for line in lines]
     direct_names = {canonicalize_name(Requirement(line).name) for line in direct}
@@ -112,39 +112,39 @@ def bill(lock: str, project: Mapping[str, Any], time_s: int) -> dict[str, Any]:
         "$schema": "http://cyclonedx.org/schema/bom-1.6.schema.json",
         "bomFormat": "CycloneDX",
         "specVersion": "1.6",
-        "serialNumber": f"urn:uuid:{uuid.uuid5(uuid.NAMESPACE_URL, own + lock)}",
+        "serialNumber": f"urn:uuid:{uuid.uuid5(uuid.NAMESPACE_URL, purl + lock)}",
         "version": 1,
         "metadata": {
             "timestamp": datetime.fromtimestamp(time_s, UTC).isoformat().replace("+00:00", "Z"),
             "component": {
                 "type": "application",
-                "bom-ref": own,
+                "bom-ref": purl,
                 "name": project["name"],
                 "version": project["version"],
-                "purl": own,
+                "purl": purl,
                 "licenses": [{"license": {"id": project["license"]}}],
             },
         },
-        "components": [_component(one, scope_of[one.name]) for one in packages],
+        "components": [_component(package, scope_of[package.name]) for package in packages],
         "dependencies": [
-            {"ref": own, "dependsOn": [p.purl for p in packages if p.name in direct_names]},
+            {"ref": purl, "dependsOn": [p.purl for p in packages if p.name in direct_names]},
             *(
                 {
-                    "ref": one.purl,
+                    "ref": package.purl,
                     "dependsOn": [
                         other.purl
                         for other in packages
-                        if one.name in map(canonicalize_name, other.needed_by)
+                        if package.name in map(canonicalize_name, other.needed_by)
                     ],
                 }
-                for one in packages
+                for package in packages
             ),
         ],
     }
 
 
 def _component(package: Locked, scope: str) -> dict[str, Any]:
-    found: dict[str, Any] = {
+    component: dict[str, Any] = {
         "type": "library",
         "bom-ref": package.purl,
         "name": package.name,
@@ -156,21 +156,21 @@ def _component(package: Locked, scope: str) -> dict[str, Any]:
                 "type": "distribution",
                 "url": package.purl,
                 "comment": "SHA-256 of each file of this version",
-                "hashes": [{"alg": "SHA-256", "content": one} for one in package.hashes],
+                "hashes": [{"alg": "SHA-256", "content": digest} for digest in package.hashes],
             }
         ],
     }
     if package.marker:
-        found["properties"] = [{"name": "undulog:marker", "value": package.marker}]
-    return found
+        component["properties"] = [{"name": "undulog:marker", "value": package.marker}]
+    return component
 
 
 def write(output: Path, root: Path, time_s: int) -> int:
     """Write the bill of a source tree; return the number of packages."""
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
-    found = bill((root / "requirements.lock").read_text(), project, time_s)
-    output.write_text(json.dumps(found, indent=1) + "\n")
-    return len(found["components"])
+    document = bill((root / "requirements.lock").read_text(), project, time_s)
+    output.write_text(json.dumps(document, indent=1) + "\n")
+    return len(document["components"])
 
 
 if __name__ == "__main__":

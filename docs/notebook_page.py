@@ -42,8 +42,8 @@ def executed_page(notebook: Path = NOTEBOOK) -> str:
             parts.append(f"```text\n{printed.rstrip()}\n```")
         if value is not None:
             parts.append(_shown(value))
-    told = f"{{download}}`The notebook itself <{notebook.name}>`"
-    return "\n\n".join([*parts, told]) + "\n"
+    link = f"{{download}}`The notebook itself <{notebook.name}>`"
+    return "\n\n".join([*parts, link]) + "\n"
 
 
 def run_cell(source: str, namespace: dict[str, Any]) -> tuple[str, Any]:

@@ -69,8 +69,8 @@ def schema_file(schema: dict[str, Any]) -> str:
 
 def _table(record: dict[str, Any], page: str) -> list[str]:
     rows = [
-        f"| `{key}` | {_kind(one, page)} | {_cell(one.get('description', ''))} |"
-        for key, one in record["properties"].items()
+        f"| `{key}` | {_kind(schema, page)} | {_cell(schema.get('description', ''))} |"
+        for key, schema in record["properties"].items()
     ]
     return ["| key | type | what |", "|---|---|---|", *rows]
 
@@ -79,25 +79,25 @@ def _cell(text: str) -> str:
     return text.replace("|", r"\|").replace("*", r"\*").replace("_", r"\_")
 
 
-def _kind(one: dict[str, Any], page: str) -> str:
+def _kind(schema: dict[str, Any], page: str) -> str:
     """Return the type of a value in a few words."""
-    if "$ref" in one:
-        kind = one["$ref"].rpartition("/")[2]
+    if "$ref" in schema:
+        kind = schema["$ref"].rpartition("/")[2]
         return f"[{kind}](#{_anchor(page, kind)})"
-    if "anyOf" in one:
-        return " or ".join(_kind(each, page) for each in one["anyOf"])
-    if "enum" in one:
-        return "one of " + ", ".join(f"`{each}`" for each in one["enum"])
-    names = one.get("type", "any")
+    if "anyOf" in schema:
+        return " or ".join(_kind(choice, page) for choice in schema["anyOf"])
+    if "enum" in schema:
+        return "one of " + ", ".join(f"`{value}`" for value in schema["enum"])
+    names = schema.get("type", "any")
     first, *rest = [names] if isinstance(names, str) else names
-    if "items" in one and "maxItems" in one:
-        first = f"{one['maxItems']} of {_kind(one['items'], page)}"
-    elif "items" in one:
-        first = f"list of {_kind(one['items'], page)}"
-    elif "prefixItems" in one:
-        first = f"[{', '.join(_kind(each, page) for each in one['prefixItems'])}]"
-    elif first == "object" and one.get("additionalProperties"):
-        first = f"by name: {_kind(one['additionalProperties'], page)}"
+    if "items" in schema and "maxItems" in schema:
+        first = f"{schema['maxItems']} of {_kind(schema['items'], page)}"
+    elif "items" in schema:
+        first = f"list of {_kind(schema['items'], page)}"
+    elif "prefixItems" in schema:
+        first = f"[{', '.join(_kind(entry, page) for entry in schema['prefixItems'])}]"
+    elif first == "object" and schema.get("additionalProperties"):
+        first = f"by name: {_kind(schema['additionalProperties'], page)}"
     return " or ".join([first, *rest])
 
 

@@ -110,15 +110,15 @@ class _Writer:
         hints = get_type_hints(cls, localns=vars(oscillators))
         described = _descriptions(cls)
         properties: dict[str, Any] = {}
-        for one in fields(cls):
-            if one.metadata == KEYS_OF_THEIR_OWN:
+        for field in fields(cls):
+            if field.metadata == KEYS_OF_THEIR_OWN:
                 continue
-            about = {"description": described[one.name]} if one.name in described else {}
-            if self._flat and cls in _FLAT and hints[one.name] is Estimate:
-                properties[one.name] = about | {"type": ["number", "null"]}
-                properties[interval_key(one.name)] = _INTERVAL
+            about = {"description": described[field.name]} if field.name in described else {}
+            if self._flat and cls in _FLAT and hints[field.name] is Estimate:
+                properties[field.name] = about | {"type": ["number", "null"]}
+                properties[interval_key(field.name)] = _INTERVAL
             else:
-                properties[one.name] = about | self._type(hints[one.name])
+                properties[field.name] = about | self._type(hints[field.name])
         if self._flat:
             properties |= _DERIVED.get(cls, {})
         return {
@@ -145,12 +145,12 @@ class _Writer:
 
     def _class(self, hint: type[Any]) -> dict[str, Any]:
         if issubclass(hint, Enum):
-            return {"enum": [one.value for one in hint]}
-        kinds = [self._reference(one) for one in _kinds(hint)]
+            return {"enum": [member.value for member in hint]}
+        kinds = [self._reference(kind) for kind in _kinds(hint)]
         return kinds[0] if len(kinds) == 1 else {"anyOf": kinds}
 
     def _one_of(self, arguments: tuple[Any, ...]) -> dict[str, Any]:
-        kinds = [self._type(one) for one in arguments if one is not NoneType]
+        kinds = [self._type(argument) for argument in arguments if argument is not NoneType]
         if NoneType not in arguments:
             return {"anyOf": kinds}
         if len(kinds) == 1 and isinstance(kinds[0].get("type"), str):
@@ -162,7 +162,7 @@ class _Writer:
             return {"type": "array", "items": self._type(arguments[0])}
         return {
             "type": "array",
-            "prefixItems": [self._type(one) for one in arguments],
+            "prefixItems": [self._type(argument) for argument in arguments],
             "minItems": len(arguments),
             "maxItems": len(arguments),
         }
@@ -182,24 +182,24 @@ class _Writer:
         name = cls.__name__
         if name not in self.definitions:
             return name
-        if any(one is cls for one, _ in self._names):
+        if any(record is cls for record, _ in self._names):
             return f"{name}Nested"
         return cls.__module__.rpartition(".")[2].title().replace("_", "") + name
 
 
 def _kinds(cls: type[Any]) -> list[type[Any]]:
     """Return the record and those that refine it, the most special first."""
-    found = [kind for one in cls.__subclasses__() for kind in _kinds(one)]
-    return [*found, cls]
+    refined = [kind for subclass in cls.__subclasses__() for kind in _kinds(subclass)]
+    return [*refined, cls]
 
 
 def _descriptions(cls: type) -> dict[str, str]:
     """Return what the docstrings of a record and its bases tell of each field."""
-    found: dict[str, str] = {}
-    for one in reversed(cls.__mro__):
-        if section := _ATTRIBUTES.search(inspect.cleandoc(one.__doc__ or "")):
-            found |= {name: _text(text) for name, text in _ENTRY.findall(section[1])}
-    return found
+    described: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if section := _ATTRIBUTES.search(inspect.cleandoc(base.__doc__ or "")):
+            described |= {name: _text(text) for name, text in _ENTRY.findall(section[1])}
+    return described
 
 
 def _text(text: str) -> str:
