@@ -112,10 +112,10 @@ def noise_of(random, noise, m, n):
     if noise == "AR(0.9)":
         drawn = random.normal(size=(m, n + 200))
         return SIGMA * lfilter([(1 - AR**2) ** 0.5], [1.0, -AR], drawn)[:, 200:]
-    own = SIGMA * random.normal(size=(m, n))
+    separate = SIGMA * random.normal(size=(m, n))
     if noise == "white":
-        return own
-    return (1 - SHARED) ** 0.5 * own + SHARED**0.5 * SIGMA * random.normal(size=n)
+        return separate
+    return (1 - SHARED) ** 0.5 * separate + SHARED**0.5 * SIGMA * random.normal(size=n)
 
 
 def half_width(noise, planes, joint, t, *, omega, response):
@@ -132,15 +132,15 @@ def half_width(noise, planes, joint, t, *, omega, response):
     weights = np.zeros(JOINTS)
     weights[others] = -basis[j] @ np.linalg.pinv(basis[others])
     weights[j] = 1.0
-    own = weights / response[joint % planes :: planes]
+    scaled = weights / response[joint % planes :: planes]
     n, power = t.size, SIGMA**2
     if noise == "AR(0.9)":
         power *= (1 - AR**2) / abs(1 - AR * np.exp(-1j * omega * (t[1] - t[0]))) ** 2
     if noise == "quantised":  # half-wave symmetry leaves so many distinct phases
         n, power = round(np.pi / (omega * (t[1] - t[0]))), STEP**2 / 12
-    single = float(np.sum(np.abs(own) ** 2))
+    single = float(np.sum(np.abs(scaled) ** 2))
     share = SHARED if noise == "shared" else 0.0
-    spread = (1 - share) * single + share * abs(np.sum(own)) ** 2
+    spread = (1 - share) * single + share * abs(np.sum(scaled)) ** 2
     factor = norm.ppf(1 - 0.025 / (3 * JOINTS * planes))
     return float(factor * (2 * power / n * spread) ** 0.5)
 
@@ -163,13 +163,15 @@ def stated(recorded):
     gait = fit_gait(*series, float(t_s[-1]), lambda _: None)
     chains = []
     for plane in dict.fromkeys(planes):
-        commanded = tuple(n for n, own in zip(joints, planes, strict=True) if own == plane)
+        commanded = tuple(
+            n for n, joint_plane in zip(joints, planes, strict=True) if joint_plane == plane
+        )
         names = tuple(name for name in commanded if name in gait.answered and name not in broken)
         response = gait.response.select([gait.answered.index(name) for name in names])
         chains.append(Chain(plane, 0, commanded, names, response))
     findings = examine(chains)
-    outside = tuple(dict.fromkeys(each.joint for each in findings.stand_out))
-    shapes = tuple(dict.fromkeys(each.kind for each in findings.shape))
+    outside = tuple(dict.fromkeys(deviation.joint for deviation in findings.stand_out))
+    shapes = tuple(dict.fromkeys(shape.kind for shape in findings.shape))
     return dict(zip(STATEMENTS, (broken, outside, shapes), strict=True))
 
 
@@ -184,12 +186,12 @@ def identical(sessions, seed=1):
 def identical_cell(sessions, seed, noise, planes):
     """Return the shares of one cell of :func:`identical`."""
     random = np.random.default_rng([seed, NOISES.index(noise), planes])
-    found = np.zeros(len(STATEMENTS) + 1)
+    counts = np.zeros(len(STATEMENTS) + 1)
     for _ in range(sessions):
         answer = stated(session(random, noise, planes))
-        each = [bool(answer[kind]) for kind in STATEMENTS]
-        found += [any(each), *each]
-    return found / sessions
+        claims = [bool(answer[kind]) for kind in STATEMENTS]
+        counts += [any(claims), *claims]
+    return counts / sessions
 
 
 def one_off(sessions, seed=2):
@@ -204,15 +206,15 @@ def one_off_cell(sessions, seed, noise, planes, quantity):
     """Return the shares of one cell of :func:`one_off`."""
     k = QUANTITIES.index(quantity)
     random = np.random.default_rng([seed, NOISES.index(noise), planes, k])
-    found = np.zeros(2)
+    counts = np.zeros(2)
     for _ in range(sessions):
         odd = int(random.integers(JOINTS * planes))
         made = session(random, noise, planes, odd=odd, quantity=quantity)
         answer = stated(made)
         named = {*answer["not following"], *answer["stands out"]}
-        own = made.names[odd]
-        found += [own in named, bool(named - {own})]
-    return found / sessions
+        joint = made.names[odd]
+        counts += [joint in named, bool(named - {joint})]
+    return counts / sessions
 
 
 def main(sessions=2000):

@@ -52,8 +52,8 @@ def print_chain(m, stall, runs, rounds, keep=KEEP):
         for now, then in zip(indices(after, wave), indices(before, wave), strict=True):
             value, low, high = ratio(now, then)
             print(f"    {now.label}, over before: {value:.3f} [{low:.3f}, {high:.3f}]")
-        at_limit = [one.name for one in plan.joints if one.lacking > 0]
-        least = min(plan.joints, key=lambda one: one.margin)
+        at_limit = [joint.name for joint in plan.joints if joint.lacking > 0]
+        least = min(plan.joints, key=lambda joint: joint.margin)
         print(
             f"    predicted {plan.predicted_gain_cv:.2%}, "
             f"{math.degrees(plan.predicted_lag_sd):.2f} degrees; identified "
@@ -69,7 +69,7 @@ def print_chain(m, stall, runs, rounds, keep=KEEP):
         commands = other.phasors * np.exp(x)
         cut = commands * np.minimum(1.0, limit / np.abs(commands))
         driven = stage.drive(other, [other.phasors, cut], [[5, 0], [5, 1]])
-        pair = [indices([one], other) for one in driven]
+        pair = [indices([run], other) for run in driven]
         (cv, lag), (cv_after, lag_after) = pair
         print(
             f"  {name}: CV {cv.value:.2%} to {cv_after.value:.2%}, lag "

@@ -39,7 +39,7 @@ NOISE = 0.02
 
 def varied(name, random):
     """Return a shipped scenario with another amplitude, lag and frequency, and the frequency."""
-    one = load_scenario(name)
+    scenario = load_scenario(name)
     amplitude, lag, speed = random.uniform([0.8, 0.9, 0.8], [1.2, 1.1, 1.2]).tolist()
     planes = {
         plane: replace(
@@ -48,11 +48,13 @@ def varied(name, random):
             lag=lag * wave.lag,
             frequency_hz=speed * wave.frequency_hz,
         )
-        for plane, wave in one.gait.planes.items()
+        for plane, wave in scenario.gait.planes.items()
     }
     frequency = next(iter(planes.values())).frequency_hz
     duration_s = round(SETTLE_S + (CYCLES + 0.2) / frequency, 2)
-    return replace(one, gait=replace(one.gait, planes=planes), duration_s=duration_s), frequency
+    return replace(
+        scenario, gait=replace(scenario.gait, planes=planes), duration_s=duration_s
+    ), frequency
 
 
 def judged(scenario, frequency, random):
@@ -66,7 +68,7 @@ def judged(scenario, frequency, random):
     touching = centres[..., 2] < [link.radius for link in robot.links]
     factor = [joint.servo.torque_constant for joint in robot.joints]
     angles, up = (_series(t_s, values) for values in (run.angle, turn[:, 2]))
-    truth, found = [], []
+    truth, estimated = [], []
     for k in range(CYCLES):
         edges = SETTLE_S + np.linspace(k, k + 1, PHASES + 1) / frequency
         part = np.digitize(t_s, edges) - 1
@@ -75,17 +77,17 @@ def judged(scenario, frequency, random):
         for torque in (run.effort, factor * run.current):
             noisy = torque + NOISE * random.standard_normal(torque.shape)
             loads.append(cycle_loads(robot, angles, _series(t_s, noisy), up, edges)[0] >= TOUCHES)
-        found.append(loads)
-    return np.array(truth), np.moveaxis(np.array(found), 1, 0)
+        estimated.append(loads)
+    return np.array(truth), np.moveaxis(np.array(estimated), 1, 0)
 
 
 def _series(t_s, columns):
-    return [Series(str(k), t_s, np.ascontiguousarray(one)) for k, one in enumerate(columns.T)]
+    return [Series(str(k), t_s, np.ascontiguousarray(values)) for k, values in enumerate(columns.T)]
 
 
-def balanced(found, truth):
+def balanced(estimated, truth):
     """Return the mean of the shares of contacts and of lifted links that are recognised."""
-    return (found[truth].mean() + (~found[~truth]).mean()) / 2
+    return (estimated[truth].mean() + (~estimated[~truth]).mean()) / 2
 
 
 def accuracy(name, seeds, runs):
@@ -94,8 +96,11 @@ def accuracy(name, seeds, runs):
     for seed in seeds:
         random = np.random.default_rng([seed, *name.encode()])
         for _ in range(runs):
-            truth, found = judged(*varied(name, random), random)
-            right = [one[truth].mean() if truth.all() else balanced(one, truth) for one in found]
+            truth, estimated = judged(*varied(name, random), random)
+            right = [
+                claim[truth].mean() if truth.all() else balanced(claim, truth)
+                for claim in estimated
+            ]
             parts.append([truth.mean(), *right])
     return np.mean(parts, axis=0)
 

@@ -32,11 +32,11 @@ SHARED = {
 
 def contrasts():
     """Each joint against the mean of the others, ends against middle, linear trend; (11, 9)."""
-    each = np.eye(JOINTS) - (1 - np.eye(JOINTS)) / (JOINTS - 1)
+    against_rest = np.eye(JOINTS) - (1 - np.eye(JOINTS)) / (JOINTS - 1)
     ends = np.full(JOINTS, -1 / (JOINTS - 2))
     ends[[0, -1]] = 0.5
     place = np.arange(JOINTS) - (JOINTS - 1) / 2
-    return np.vstack([each, ends, place / (place @ place)])
+    return np.vstack([against_rest, ends, place / (place @ place)])
 
 
 def coloured(random, runs, count, correlation):
@@ -73,11 +73,13 @@ def simulated(shared, correlation, *, runs, apart_s=8e-4, duration_s=10.3, every
     courses = [coloured(random, runs, fine.size, smooth) for _ in range(2)] if correlation else []
     ticks = random.normal(size=(2, runs, count))
     phase = 0.4 - np.arange(JOINTS) * np.pi / 4
-    found = []
+    series = []
     for joint in range(JOINTS):
         step = every[joint % 3]
         chosen = (np.arange(count) * FINE + round(apart_s * joint * RATE * FINE))[::step]
-        first, second = [one[:, chosen] for one in courses] if correlation else ticks[:, :, ::step]
+        first, second = (
+            [course[:, chosen] for course in courses] if correlation else ticks[:, :, ::step]
+        )
         alone = coloured(random, runs, count, correlation)[:, ::step]
         wave, size = OMEGA * fine[chosen] + phase[joint] - LAG, GAIN * AMPLITUDE
         if shared == "nothing":
@@ -86,8 +88,8 @@ def simulated(shared, correlation, *, runs, apart_s=8e-4, duration_s=10.3, every
             values = size * np.cos(wave) + 0.01 * first + 0.003 * alone
         else:
             values = size * (1 + 0.02 * first) * np.cos(wave + 0.02 * second) + 0.003 * alone
-        found += [Series("r", fine[chosen], one) for one in values]
-    return found, phase
+        series += [Series("r", fine[chosen], row) for row in values]
+    return series, phase
 
 
 def judged(shared, correlation, *, runs=300, **more):
@@ -107,27 +109,27 @@ def judged(shared, correlation, *, runs=300, **more):
     fit = fit_at(responses, OMEGA)
     noise, bins = residual_spectrum(responses, fit)
     t = responses[0].t_s
-    commands = [Series("c", t, AMPLITUDE * np.cos(OMEGA * t + one)) for one in phase]
+    commands = [Series("c", t, AMPLITUDE * np.cos(OMEGA * t + angle)) for angle in phase]
     asked = fit_at(commands, OMEGA)
     exact, exact_bins = residual_spectrum(commands, asked)
     weights, inside = contrasts(), []
     for run in range(runs):
-        own = np.arange(JOINTS) * runs + run
-        found = respond(
+        indices = np.arange(JOINTS) * runs + run
+        estimates = respond(
             asked.fundamental,
             exact,
-            fit.fundamental[own],
-            FundamentalNoise(noise.level[own], noise.dof[own], noise.covariance[own]),
-            bins=(exact_bins, bins.select(own)),
+            fit.fundamental[indices],
+            FundamentalNoise(noise.level[indices], noise.dof[indices], noise.covariance[indices]),
+            bins=(exact_bins, bins.select(indices)),
         )
-        values = weights @ np.log(found.gain), weights @ found.lag_rad
+        values = weights @ np.log(estimates.gain), weights @ estimates.lag_rad
         apart = [
-            (weights**2 @ one, np.full(len(weights), found.dof[0] * JOINTS))
-            for one in (found.log_gain_variance, found.lag_variance)
+            (weights**2 @ variance, np.full(len(weights), estimates.dof[0] * JOINTS))
+            for variance in (estimates.log_gain_variance, estimates.lag_variance)
         ]
         judge = [
-            (one.variance(weights), np.full(len(weights), one.columns.shape[1]))
-            for one in scatter_of(found.errors)
+            (scatter.variance(weights), np.full(len(weights), scatter.columns.shape[1]))
+            for scatter in scatter_of(estimates.errors)
         ]
         inside.append([_holds(values, judge), _holds(values, apart)])
     return np.mean(inside, axis=0)
@@ -135,7 +137,7 @@ def judged(shared, correlation, *, runs=300, **more):
 
 def _holds(values, judge):
     """Return whether each interval holds zero, (2, 11)."""
-    factors = [[t_factor(one) for one in dof] for _, dof in judge]
+    factors = [[t_factor(freedom) for freedom in dof] for _, dof in judge]
     return np.abs(values) <= np.array(factors) * np.sqrt([variance for variance, _ in judge])
 
 
@@ -151,7 +153,7 @@ def main():
             (gain, lag), summed = np.mean(parts, axis=0)
             cells = [gain[:JOINTS].mean(), lag[:JOINTS].mean()]
             cells += [gain[JOINTS], lag[JOINTS], gain[-1], lag[-1], *summed[:, JOINTS]]
-            text = " | ".join(f"{100 * one:.1f} %" for one in cells)
+            text = " | ".join(f"{100 * share:.1f} %" for share in cells)
             print(f"| {name} | {correlation:g} | {text} |")
 
 

@@ -57,7 +57,11 @@ class Figures:
     @property
     def flags(self) -> list[tuple[str, str]]:
         """Joints and what their sensors are blamed for; nothing, on the twin."""
-        return [(one.joint, one.flag) for one in self.analysis.artefacts if one.about == "sensor"]
+        return [
+            (artefact.joint, artefact.flag)
+            for artefact in self.analysis.artefacts
+            if artefact.about == "sensor"
+        ]
 
 
 def figures(path):
@@ -66,7 +70,7 @@ def figures(path):
         measured = measure_session(session)
         ledger = booked_energies(session, measured.span)
         columns = read_columns(session, "/joint_commands", RESPONSE_TOPIC, _ignore)
-        without = dataclasses.replace(columns, powers={one: {} for one in columns.powers})
+        without = dataclasses.replace(columns, powers={joint: {} for joint in columns.powers})
         products = joint_energies(session, without, (), measured.span, _ignore)
     booked = {name: ledger[term] for name, (*_, term) in TERMS.items()}
     scale = booked | {"net": max(abs(booked["net"]), NET_FLOOR * booked["abs"])}
@@ -76,32 +80,32 @@ def figures(path):
         return {name: (whole[name] - booked[name]) / abs(scale[name]) for name in TERMS}
 
     left = (ledger[f"{kind}_residual"] / booked["abs"] for kind in ("mechanical", "electrical"))
-    own = errors(measured.energies), errors(products), tuple(left)
-    return Figures(booked, *own, measured.analysis)
+    parts = errors(measured.energies), errors(products), tuple(left)
+    return Figures(booked, *parts, measured.analysis)
 
 
 def run(name, folder):
     """Run a shipped scenario and hold its energies against its ledger."""
     path = Path(folder) / f"{name}.mcap"
     record(load_scenario(name), path, kernels=Kernels.NUMBA, force=True)
-    found = figures(path)
+    result = figures(path)
     path.unlink()
-    return found
+    return result
 
 
-def row(name, found):
+def row(name, result):
     """Return one row of the table."""
-    booked = (found.booked[one] for one in TITLES)
-    cells = [f"{one:.3g}" if abs(one) < 1000 else f"{one:.0f}" for one in booked]
-    cells += [f"{100 * max(abs(one) for one in found.errors.values()):.4f}"]
-    cells += [f"{100 * found.sampled[one]:+.2f}" for one in TITLES]
+    booked = (result.booked[term] for term in TITLES)
+    cells = [f"{energy:.3g}" if abs(energy) < 1000 else f"{energy:.0f}" for energy in booked]
+    cells += [f"{100 * max(abs(error) for error in result.errors.values()):.4f}"]
+    cells += [f"{100 * result.sampled[term]:+.2f}" for term in TITLES]
     return f"| `{name}` | {' | '.join(cells)} |"
 
 
 def table(rows):
     """Return the table as Markdown."""
-    heads = ["scenario", *(f"{one} [J]" for one in TITLES.values()), "largest error [%]"]
-    heads += [f"{one} by samples [%]" for one in TITLES.values()]
+    heads = ["scenario", *(f"{title} [J]" for title in TITLES.values()), "largest error [%]"]
+    heads += [f"{title} by samples [%]" for title in TITLES.values()]
     ruler = "|---|" + "---:|" * (len(heads) - 1)
     return "\n".join([f"| {' | '.join(heads)} |", ruler, *rows])
 
@@ -122,11 +126,14 @@ def main():
     rows, worst, left, flags = [], 0.0, [0.0, 0.0], []
     with tempfile.TemporaryDirectory() as folder:
         for name in options.names or scenario_names():
-            found = run(name, folder)
-            rows.append(row(name, found))
-            worst = max(worst, *(abs(one) for one in found.errors.values()))
-            left = [max(one, abs(own)) for one, own in zip(left, found.balance, strict=True)]
-            flags += [(name, *flag) for flag in found.flags]
+            result = run(name, folder)
+            rows.append(row(name, result))
+            worst = max(worst, *(abs(error) for error in result.errors.values()))
+            left = [
+                max(largest, abs(residual))
+                for largest, residual in zip(left, result.balance, strict=True)
+            ]
+            flags += [(name, *flag) for flag in result.flags]
             print(rows[-1], flush=True)
     if options.write:
         before, _, rest = PAGE.read_text().partition(BEGIN)

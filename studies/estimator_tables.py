@@ -81,18 +81,26 @@ def sampled(
     noise = random.normal(size=(draws, count + 200 * bool(ar)))
     if ar:
         noise = lfilter([(1 - ar**2) ** 0.5], [1.0, -ar], noise)[:, 200:]
-    own = t + skew_s
-    clean = GAIN * amplitude * np.sin(omega * own + phase - LAG)
-    return t, amplitude * np.sin(omega * t + phase), own[kept], (clean + sigma * noise)[:, kept]
+    response_t = t + skew_s
+    clean = GAIN * amplitude * np.sin(omega * response_t + phase - LAG)
+    return (
+        t,
+        amplitude * np.sin(omega * t + phase),
+        response_t[kept],
+        (clean + sigma * noise)[:, kept],
+    )
 
 
-def fitted(t, command, own, responses, guess):
+def fitted(t, command, response_t, responses, guess):
     """Our fit: lag errors, gain errors (relative), and half widths of both 95 % intervals."""
-    series = [Series("c", t, command), *(Series("r", own, one) for one in responses)]
+    series = [
+        Series("c", t, command),
+        *(Series("r", response_t, response) for response in responses),
+    ]
     fit = fit_shared(series, guess)
     noise = residual_noise(series, fit)
-    found, half = responded(fit, noise, [0] * len(responses), slice(1, None))
-    return found.lag_rad - LAG, found.gain / GAIN - 1, half
+    estimates, half = responded(fit, noise, [0] * len(responses), slice(1, None))
+    return estimates.lag_rad - LAG, estimates.gain / GAIN - 1, half
 
 
 def responded(fit, noise, commands, answers):
@@ -101,9 +109,9 @@ def responded(fit, noise, commands, answers):
         FundamentalNoise(noise.level[k], noise.dof[k], noise.covariance[k])
         for k in (commands, answers)
     ]
-    found = respond(fit.fundamental[commands], part[0], fit.fundamental[answers], part[1])
-    factor = np.array([t_factor(dof) for dof in found.dof])
-    return found, factor * np.sqrt([found.lag_variance, found.log_gain_variance])
+    estimates = respond(fit.fundamental[commands], part[0], fit.fundamental[answers], part[1])
+    factor = np.array([t_factor(dof) for dof in estimates.dof])
+    return estimates, factor * np.sqrt([estimates.lag_variance, estimates.log_gain_variance])
 
 
 def by_hilbert(command, response):
@@ -134,12 +142,12 @@ def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000
     """
     random = np.random.default_rng(seed)
     how = {"draws": draws, "cycles": duration * frequency, "rate": rate, "sigma": sigma}
-    t, command, own, responses = sampled(random, **how, frequency=frequency)
+    t, command, response_t, responses = sampled(random, **how, frequency=frequency)
     omega = 2 * np.pi * frequency
     bound = (2 * sigma**2 / ((GAIN * 0.5) ** 2 * t.size)) ** 0.5
     rows = {}
     start = time.process_time()
-    lag, gain, half = fitted(t, command, own, responses, 1.002 * omega)
+    lag, gain, half = fitted(t, command, response_t, responses, 1.002 * omega)
     took = (time.process_time() - start) / draws
     covered = float(np.mean(np.abs(lag) <= half[0]))
     rows["harmonic least squares, shared frequency"] = (*_figures(lag, gain, bound), covered, took)
@@ -150,16 +158,20 @@ def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000
     }
     for name, way in ways.items():
         start = time.process_time()
-        found = np.array([way(one) for one in responses])
+        estimates = np.array([way(response) for response in responses])
         took = (time.process_time() - start) / draws
-        rows[name] = (*_figures(found[:, 0] - LAG, found[:, 1] / GAIN - 1, bound), None, took)
+        rows[name] = (
+            *_figures(estimates[:, 0] - LAG, estimates[:, 1] / GAIN - 1, bound),
+            None,
+            took,
+        )
     return rows
 
 
 def _figures(lag, gain, bound):
     """Return bias and sd of lag [degrees], RMSE over bound of lag and gain."""
     degrees = np.degrees([lag.mean(), lag.std()])
-    return (*degrees, *(np.sqrt(np.mean(one**2)) / bound for one in (lag, gain)))
+    return (*degrees, *(np.sqrt(np.mean(errors**2)) / bound for errors in (lag, gain)))
 
 
 def coverage(cycles, ar, *, draws=4000, seed=1, **more):
@@ -208,16 +220,16 @@ def rounded(
     answer = step * np.rint((answer + sigma * random.normal(size=answer.shape)) / step)
     command = size * np.sin(omega * t + turned)
     command = step * np.rint(command / step) if command_too else command
-    series = [Series("q", t, one) for one in (*command, *answer)]
+    series = [Series("q", t, samples) for samples in (*command, *answer)]
     fit = fit_at(series, omega)
     noise, bins = residual_spectrum(series, fit)
     level = np.mean(np.abs(bins.values) ** 2, axis=1)
     dof = np.full(level.size, 2.0 * bins.offset.size)
     alone = FundamentalNoise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
     covered = []
-    for one in (alone, noise):
-        found, half = responded(fit, one, slice(draws), slice(draws, None))
-        error = np.array([found.lag_rad - lag[:, 0], np.log(found.gain / GAIN)])
+    for noise_model in (alone, noise):
+        estimates, half = responded(fit, noise_model, slice(draws), slice(draws, None))
+        error = np.array([estimates.lag_rad - lag[:, 0], np.log(estimates.gain / GAIN)])
         covered.append(np.mean(np.abs(error) <= half, axis=1))
     rms = np.sqrt(np.mean((error * size[:, 0]) ** 2, axis=1))
     return covered[1], covered[0], np.median(half * size[:, 0], axis=1) / rms
@@ -239,14 +251,16 @@ def main():
     for cycles in (7.0, 7.4, 10.0, 20.0):
         kinds = ({"ar": 0.0}, {"ar": 0.9}, {"ar": 0.9, "lost": 0.2})
         parts = [coverage(cycles, **kind, **draws) for kind in kinds]
-        cells = " | ".join(f"{100 * one:.1f} %" for part in parts for one in part)
+        cells = " | ".join(f"{100 * share:.1f} %" for part in parts for share in part)
         print(f"| {cycles:g} | {cells} |")
     columns = ("lag", "gain", "half width / RMSE: lag", "gain", "residual alone: lag", "gain")
     print(f"\n| rounded to steps | {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|")
     for name, case in ROUNDED.items():
         covered, alone, width = rounded(**case, **draws)
-        both, few = (" | ".join(f"{100 * one:.1f} %" for one in part) for part in (covered, alone))
+        both, few = (
+            " | ".join(f"{100 * share:.1f} %" for share in part) for part in (covered, alone)
+        )
         print(f"| {name} | {both} | {width[0]:.2f} | {width[1]:.2f} | {few} |")
 
 

@@ -110,15 +110,15 @@ def judge(case: Case, seed: int) -> dict[str, bool]:
     mine = [point for k, point in changes if (k, point.joint) == (0, joint)]
     near = [min(mine, key=lambda p: abs(p.session - start), default=None) for start in starts]
     truths = [*zip(near, starts, np.log1p(case.steps), strict=True)]
-    found = bool(starts) and len(mine) >= len(starts)
+    detected = bool(starts) and len(mine) >= len(starts)
     return {
         "any": bool(points),
         "change": bool(changes),
         "outlier": len(changes) < len(points),
         "false": any(k != 0 or point.joint != joint for k, point in points),
-        "found": found,
-        "dated": found and all(p is not None and p.first <= s <= p.last for p, s, _ in truths),
-        "sized": found
+        "found": detected,
+        "dated": detected and all(p is not None and p.first <= s <= p.last for p, s, _ in truths),
+        "sized": detected
         and all(p is not None and p.change_ci95[0] <= d <= p.change_ci95[1] for p, _, d in truths),
     }
 

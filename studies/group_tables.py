@@ -46,14 +46,14 @@ class Snake:
         self.skew_s = 2e-3
         self.group = np.arange(joints) % 2
         self.omega = 2 * np.pi * 0.954 * np.array([ratio, 1.0])
-        own = self.omega[self.group][:, None]
+        omega = self.omega[self.group][:, None]
         self.amplitude = rng.uniform(0.3, 0.5, joints)
         phase = rng.uniform(-3, 3, 2)[self.group] - 0.8 * np.arange(joints)
-        self.command = self.amplitude[:, None] * np.sin(own * self.t + phase[:, None])
+        self.command = self.amplitude[:, None] * np.sin(omega * self.t + phase[:, None])
         gain, lag = rng.uniform(0.85, 1.05, joints), rng.uniform(0.05, 0.4, joints)
         later = self.t + self.skew_s
         size = (gain * self.amplitude)[:, None]
-        alone = size * np.sin(own * later + (phase - lag)[:, None])
+        alone = size * np.sin(omega * later + (phase - lag)[:, None])
         self.response = alone + 0.05 * rng.normal(size=(joints, joints)) @ alone
         beside = np.roll(self.response, 1, axis=0)
         self.response = self.response + bend * beside * (self.response + beside * self.response)
@@ -72,13 +72,13 @@ class Snake:
 
     def estimates(self, gait):
         """Return lags and gains with both ends of their intervals, by joint, shape (2, 3, m)."""
-        found = np.full((2, 3, self.joints), np.nan)
+        estimates = np.full((2, 3, self.joints), np.nan)
         for group in gait.groups:
             for k, name in enumerate(group.answered):
                 for row, estimate in enumerate((lag_estimate, gain_estimate)):
-                    one = estimate(group.response, k)
-                    found[row, :, self.names.index(name)] = one.value, *one.ci95
-        return found
+                    result = estimate(group.response, k)
+                    estimates[row, :, self.names.index(name)] = result.value, *result.ci95
+        return estimates
 
     def bound(self, sigma):
         """Return Cramér-Rao bound of each lag, all tones and the shared frequencies unknown [rad].
@@ -104,15 +104,15 @@ class Snake:
             for b, (line, order, k) in enumerate(lines):
                 re, im = theta[1 + 2 * b, j], theta[2 + 2 * b, j]
                 slope[k] -= order * t * (re * np.sin(line * t) + im * np.cos(line * t))
-            own = slice(j * p, (j + 1) * p)
-            fisher[own, own] = phi @ phi.T
-            fisher[own, -q:], fisher[-q:, own] = phi @ slope.T, slope @ phi.T
+            span = slice(j * p, (j + 1) * p)
+            fisher[span, span] = phi @ phi.T
+            fisher[span, -q:], fisher[-q:, span] = phi @ slope.T, slope @ phi.T
             fisher[-q:, -q:] += slope @ slope.T
         covariance = sigma**2 * np.linalg.inv(fisher)
         result = np.zeros(self.joints)
         for j in range(self.joints):
             k = self.group[j] if len(distinct) > 1 else 0
-            b = next(i for i, (_, order, own) in enumerate(lines) if (order, own) == (1, k))
+            b = next(i for i, (_, order, group) in enumerate(lines) if (order, group) == (1, k))
             place = j * p + 1 + 2 * b
             a = complex(theta[1 + 2 * b, j], theta[2 + 2 * b, j])
             across = np.array([-a.imag, a.real]) / abs(a)
@@ -131,9 +131,9 @@ def draws_of(snake, sigma, count, seed):
     truth = snake.estimates(snake.fit())[:, 0]
     error, covered = [], []
     for _ in range(count):
-        found = snake.estimates(snake.fit(rng.normal(0, sigma, snake.response.shape)))
-        error.append(found[0, 0] - truth[0])
-        covered.append((found[:, 1] <= truth) & (truth <= found[:, 2]))
+        estimates = snake.estimates(snake.fit(rng.normal(0, sigma, snake.response.shape)))
+        error.append(estimates[0, 0] - truth[0])
+        covered.append((estimates[:, 1] <= truth) & (truth <= estimates[:, 2]))
     return np.array(error), np.array(covered)
 
 
@@ -141,10 +141,10 @@ def figures(snake, sigma, draws, seed=5):
     """Return RMSE of the lag over its bound, and coverage of lag and gain, shape (groups, 3)."""
     error, covered = draws_of(snake, sigma, draws, seed)
     ratio = np.mean(error**2, axis=0) / snake.bound(sigma) ** 2
-    one = snake.omega[0] == snake.omega[1]
-    members = [np.ones(snake.joints, bool)] if one else [snake.group == k for k in (0, 1)]
+    same = snake.omega[0] == snake.omega[1]
+    members = [np.ones(snake.joints, bool)] if same else [snake.group == k for k in (0, 1)]
     return np.array(
-        [[np.sqrt(ratio[own].mean()), *covered[:, :, own].mean(axis=(0, 2))] for own in members]
+        [[np.sqrt(ratio[mask].mean()), *covered[:, :, mask].mean(axis=(0, 2))] for mask in members]
     )
 
 

@@ -76,7 +76,7 @@ def cases(ways, weakened, folder, most=None):
     names, _ = profile(ways[0], (ways[0].robot.joints[0].name, 0.0), folder)
     middle = names[len(names) // 2] if len(names) % 2 else None
     for share in weakened:
-        for name in [one for one in names if one != middle][:most]:
+        for name in [name for name in names if name != middle][:most]:
             runs = [profile(way, (name, share), folder)[1] for way in ways]
             for scatter in SCATTER:
                 yield name, share, scatter, *rates(names, name, runs, np.radians(scatter))
@@ -85,29 +85,31 @@ def cases(ways, weakened, folder, most=None):
 def rates(names, weak, ways, scatter, *, runs=6, seed=1):
     """Shares of experiments in which a difference is found, and the weak module is named first."""
     random = np.random.default_rng(seed)
-    found = named = 0
+    detected = named = 0
     for _ in range(SETS):
         noise = random.normal(0.0, scatter, (2, 2, runs, len(names)))
-        test = mirror_test(*(y + one[0] + 1j * one[1] for y, one in zip(ways, noise, strict=True)))
+        test = mirror_test(
+            *(y + offset[0] + 1j * offset[1] for y, offset in zip(ways, noise, strict=True))
+        )
         first = ordered_pairs(names, test)[:1]
-        found += test.p < LEVEL
+        detected += test.p < LEVEL
         named += bool(first) and first[0].name == weak
-    return found / SETS, named / SETS
+    return detected / SETS, named / SETS
 
 
 def table(title, ways_of, weakened, folder, most=None):
     """Print one row for each weakening and scatter: mean rates, and the worst case."""
     rows = defaultdict(list)
     for label, ways in ways_of:
-        for name, share, scatter, found, named in cases(ways, weakened, folder, most):
-            rows[share, scatter].append((named, found, f"{label} {name}".strip()))
+        for name, share, scatter, detected, named in cases(ways, weakened, folder, most):
+            rows[share, scatter].append((named, detected, f"{label} {name}".strip()))
     print(title)
     for (share, scatter), seen in sorted(rows.items(), reverse=True):
-        named, found = (np.mean([one[k] for one in seen]) for k in (0, 1))
+        named, detected = (np.mean([case[k] for case in seen]) for k in (0, 1))
         low = min(seen)
         print(
-            f"  {100 * share:3.0f} %  {scatter:4.2f}°  {len(seen):3d} cases  found {found:6.1%}  "
-            f"named {named:6.1%}  worst {low[0]:4.0%} ({low[2]})",
+            f"  {100 * share:3.0f} %  {scatter:4.2f}°  {len(seen):3d} cases  "
+            f"found {detected:6.1%}  named {named:6.1%}  worst {low[0]:4.0%} ({low[2]})",
             flush=True,
         )
 

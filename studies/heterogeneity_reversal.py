@@ -138,8 +138,8 @@ def experiments(case, folder, *, balanced, count, scatter, seed):
     random = np.random.default_rng(seed)
     headings = (0, 180) if balanced and case.tilt_deg else (0, 0)
     ways = [
-        np.stack([each(replace(case, heading_deg=one), folder) for one in headings])
-        for each in (profile, other_way)
+        np.stack([simulate(replace(case, heading_deg=heading), folder) for heading in headings])
+        for simulate in (profile, other_way)
     ]
     # The wave at one heading is the mirror image of its reverse at the other.
     strata = (np.repeat([0, 1], 3), np.repeat([1, 0], 3)) if balanced else None
@@ -180,11 +180,13 @@ def check_cancelling(folder, tilts, directions):
     print(f"{'floor':22}|d| in degrees: one heading, balanced; common/contrast, one heading")
     for tilt in tilts:
         for direction in directions:
-            plus = [profile(Case(tilt, direction, one), folder) for one in (0, 180)]
-            minus = [other_way(Case(tilt, direction, one), folder)[::-1] for one in (0, 180)]
-            one, both = plus[0] - minus[0], (plus[0] + plus[1] - minus[0] - minus[1]) / 2
-            ratio = np.linalg.norm(one + one[::-1]) / np.linalg.norm(one - one[::-1])
-            size = [math.degrees(np.abs(d).max()) for d in (one, both)]
+            plus = [profile(Case(tilt, direction, heading), folder) for heading in (0, 180)]
+            minus = [
+                other_way(Case(tilt, direction, heading), folder)[::-1] for heading in (0, 180)
+            ]
+            single, both = plus[0] - minus[0], (plus[0] + plus[1] - minus[0] - minus[1]) / 2
+            ratio = np.linalg.norm(single + single[::-1]) / np.linalg.norm(single - single[::-1])
+            size = [math.degrees(np.abs(d).max()) for d in (single, both)]
             print(f"  {tilt:3.1f} {direction:9s} {size[0]:16.3f} {size[1]:10.4f} {ratio:10.2f}")
 
 

@@ -63,14 +63,14 @@ def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
     """Return share of experiments with identical modules in which a difference is claimed."""
     random = np.random.default_rng(seed)
     forward = boundary_pattern(joints)
-    one = np.zeros(runs, dtype=np.int64)
-    design = Strata.of(one, one)
+    first = np.zeros(runs, dtype=np.int64)
+    design = Strata.of(first, first)
     labels = design.labellings()
     claimed = 0
     for _ in range(sets // 100):
-        one = sensed(random, forward, sets=100, runs=runs, **noise)
+        first = sensed(random, forward, sets=100, runs=runs, **noise)
         other = sensed(random, forward[::-1], sets=100, runs=runs, **noise)
-        claimed += np.count_nonzero(_p(one, other, design, labels) < LEVEL)
+        claimed += np.count_nonzero(_p(first, other, design, labels) < LEVEL)
     return claimed / sets
 
 
@@ -80,7 +80,7 @@ def _p(forward, reverse, design, labels):
     half = both.shape[-1] // 2
     odd, even = (both - both[..., ::-1]) / 2, (both + both[..., ::-1]) / 2
     columns = odd[..., :half], even[..., : both.shape[-1] - half]
-    runs = np.concatenate([parts(one) for one in columns], axis=-1)
+    runs = np.concatenate([parts(column) for column in columns], axis=-1)
     return family_wise_p(np.abs(design.scores(runs, labels))).min(axis=-1)
 
 
@@ -101,9 +101,11 @@ def with_weak_servo(scenario, joint, share):
 def responses(path):
     """Return the names of a session's driven joints, and ln(response/command), shape (m,)."""
     with Session.open(path) as session:
-        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
-    y = [np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints]
-    return [one.name for one in joints], np.array(y)
+        joints = [
+            joint for joint in analyse_session(session).joints if joint.gain.value is not None
+        ]
+    y = [np.log(joint.gain.value) - 1j * joint.lag_rad.value for joint in joints]
+    return [joint.name for joint in joints], np.array(y)
 
 
 def power(names, forward, reverse, scatter, *, runs=6, sets=500, seed=1):
@@ -122,15 +124,15 @@ def power(names, forward, reverse, scatter, *, runs=6, sets=500, seed=1):
         The two shares.
     """
     random = np.random.default_rng(seed)
-    found = named = 0
+    detected = named = 0
     for _ in range(sets):
         draw = random.normal(0.0, scatter, (2, 2, runs, len(names)))
         noise = draw[0] + 1j * draw[1]
         test = mirror_test(forward + noise[0], reverse + noise[1])
         pairs = ordered_pairs(names, test)
-        found += test.p < LEVEL
+        detected += test.p < LEVEL
         named += bool(pairs) and pairs[0].name == WEAK
-    return found / sets, named / sets
+    return detected / sets, named / sets
 
 
 def main():
@@ -154,10 +156,10 @@ def main():
                 twin_profile(way, weakened, folder, kernels) for way in WAYS
             )
             for scatter in (0.05, 0.1, 0.3, 1.0):
-                found, named = power(
+                detected, named = power(
                     names, forward, reverse, np.radians(scatter), sets=20 if quick else 500
                 )
-                print(f"  {100 * weakened:3.0f} %  {scatter:4.2f}°  {found:6.1%}  {named:6.1%}")
+                print(f"  {100 * weakened:3.0f} %  {scatter:4.2f}°  {detected:6.1%}  {named:6.1%}")
 
 
 if __name__ == "__main__":

@@ -48,8 +48,8 @@ def chain(m, *, coupled=True):
 def plan(m, base_runs=6):
     """Return the kicks of an experiment, None for a run of the gait as it is."""
     kinds = (KickKind.PHASE, KickKind.AMPLITUDE)
-    each = [Kick(j, kind, s * KICK) for kind in kinds for j in range(m) for s in (1, -1)]
-    return [None] * base_runs + each
+    kicks = [Kick(j, kind, s * KICK) for kind in kinds for j in range(m) for s in (1, -1)]
+    return [None] * base_runs + kicks
 
 
 def experiments(random, count, kicks, H, c, *, scatter, how="each"):
@@ -84,9 +84,9 @@ def experiments(random, count, kicks, H, c, *, scatter, how="each"):
             order = random.permutation(shape[0]) / shape[0] - 0.5
             moved = np.sqrt(12) * order[:, None] * (1 + 1j) * np.ones(m)
         log = clean + scatter * moved + NOISE * _complex(random, shape)
-        said = NOISE**2 * random.chisquare(FIT_DOF, (2, *shape)) / FIT_DOF
+        stated = NOISE**2 * random.chisquare(FIT_DOF, (2, *shape)) / FIT_DOF
         yield ResponseMatrices(
-            log - log[base].mean(axis=0), said[0], said[1], np.full(shape, FIT_DOF)
+            log - log[base].mean(axis=0), stated[0], stated[1], np.full(shape, FIT_DOF)
         )
 
 
@@ -109,18 +109,18 @@ def row(random, count, m, scatter_deg, *, coupled=True, base_runs=6, how="each",
     halves = []
     scatter = np.radians(scatter_deg)
     for answers in experiments(random, count, kicks, H, c, scatter=scatter, how=how):
-        found = local_matrices(kicks, answers, amplitude=True)
+        result = local_matrices(kicks, answers, amplitude=True)
         for name, value in truth.items():
-            matrix = getattr(found, name)
+            matrix = getattr(result, name)
             inside[name] += np.abs(matrix.value - value) <= matrix.half
-        shown += bool((np.abs(found.P.value) > found.P.half_together)[off].any())
-        failed += not found.agree.all()
-        halves.append(np.median(found.P.half))
+        shown += bool((np.abs(result.P.value) > result.P.half_together)[off].any())
+        failed += not result.agree.all()
+        halves.append(np.median(result.P.half))
         if index:
-            matrices = (found.P, found.R, found.G, found.S)
-            of = nonlinearity(*matrices, correlation=found.errors.correlation)
+            matrices = (result.P, result.R, result.G, result.S)
+            of = nonlinearity(*matrices, correlation=result.errors.correlation)
             called += of.ci95 is not None and of.ci95[0] > 0
-    shares = {name: float(one.mean() / count) for name, one in inside.items()}
+    shares = {name: float(hits.mean() / count) for name, hits in inside.items()}
     return {
         **shares,
         "worst": float(inside["P"].mean(axis=1).min() / count),
@@ -150,11 +150,11 @@ def main():
     words["drift"] = ", a drift"
     for m, scatter, how, base_runs in rows:
         few = count if m < 10 else count // 3
-        one = row(random, few, m, scatter, how=how, base_runs=base_runs)
+        result = row(random, few, m, scatter, how=how, base_runs=base_runs)
         what = f"{scatter:g}°{words[how]}{', one run without a kick' if base_runs == 1 else ''}"
-        shares = " | ".join(f"{100 * one[k]:.1f} %" for k in ("P", "R", "G", "S", "worst"))
-        ends = " | ".join(f"{100 * one[k]:.1f} %" for k in ("nonlinear", "rows"))
-        print(f"| {m} | {what} | {shares} | {one['half']:.3f} | {ends} |", flush=True)
+        shares = " | ".join(f"{100 * result[k]:.1f} %" for k in ("P", "R", "G", "S", "worst"))
+        ends = " | ".join(f"{100 * result[k]:.1f} %" for k in ("nonlinear", "rows"))
+        print(f"| {m} | {what} | {shares} | {result['half']:.3f} | {ends} |", flush=True)
     print(
         "\n| joints | scatter | coupling shown without any | with it (0.03 to 0.06) |"
         "\n|---|---|---|---|"

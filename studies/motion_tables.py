@@ -98,12 +98,12 @@ def twin_motions(servo, tables, cycles, runs=1):
     robot = scenario.robot
     driven = [k for k, joint in enumerate(robot.joints) if joint.plane in scenario.gait.planes]
     names = tuple(robot.joint_names[k] for k in driven)
-    found = []
+    motions = []
     for run in run_batch(scenarios):
         if run.error is not None:
             raise run.error
-        found.append(Motion(robot, names, run.time_s, run.angle[:, driven]))
-    return found
+        motions.append(Motion(robot, names, run.time_s, run.angle[:, driven]))
+    return motions
 
 
 def foreign(motion, cycles, random, noise):
@@ -134,12 +134,12 @@ def measure(robot, series, seconds):
     motion, _ = free_motion(robot, fit_motion(series, gait))
     half = t_factor(gait.omega_dof) * gait.omega_error
     omega = gait.fit.omega
-    lags = [one.lag_rad for one in motion.joints if one.lag_rad.value is not None]
-    waves = [one.wave_number for one in motion.waves]
+    lags = [joint.lag_rad for joint in motion.joints if joint.lag_rad.value is not None]
+    waves = [wave.wave_number for wave in motion.waves]
     return {
         "frequency": [(omega, (omega - half, omega + half))],
-        "lags": [(one.value, one.ci95) for one in lags],
-        "wave numbers": [(one.value, one.ci95) for one in waves],
+        "lags": [(lag.value, lag.ci95) for lag in lags],
+        "wave numbers": [(wave.value, wave.ci95) for wave in waves],
     }
 
 
@@ -151,8 +151,8 @@ def truth(motion, cycles):
         name: Series(name, t, np.ascontiguousarray(motion.angles[at, k]))
         for k, name in enumerate(motion.names)
     }
-    found = measure(motion.robot, series, cycles / FREQUENCY_HZ)
-    return {name: np.array([value for value, _ in parts]) for name, parts in found.items()}
+    measured = measure(motion.robot, series, cycles / FREQUENCY_HZ)
+    return {name: np.array([value for value, _ in parts]) for name, parts in measured.items()}
 
 
 def bound(motion, cycles, noise):
@@ -161,12 +161,12 @@ def bound(motion, cycles, noise):
     omega = truth(motion, cycles)["frequency"][0]
     order = np.arange(1, HARMONICS + 1)
     sizes, inverses, turns, information = [], [], [], 0.0
-    for one in series.values():
-        turning = np.exp(1j * omega * np.outer(one.t_s, order))
-        columns = np.hstack([np.ones((one.count, 1)), turning.real, -turning.imag])
-        fitted = np.linalg.lstsq(columns, one.values, rcond=None)[0]
+    for signal in series.values():
+        turning = np.exp(1j * omega * np.outer(signal.t_s, order))
+        columns = np.hstack([np.ones((signal.count, 1)), turning.real, -turning.imag])
+        fitted = np.linalg.lstsq(columns, signal.values, rcond=None)[0]
         amplitudes = fitted[1 : 1 + HARMONICS] + 1j * fitted[1 + HARMONICS :]
-        by_omega = one.t_s * np.real(turning @ (1j * order * amplitudes))
+        by_omega = signal.t_s * np.real(turning @ (1j * order * amplitudes))
         inverse = np.linalg.inv(columns.T @ columns)
         drift = -inverse @ (columns.T @ by_omega)
         information += by_omega @ (by_omega + columns @ drift)
@@ -179,8 +179,8 @@ def bound(motion, cycles, noise):
     for k, inverse in enumerate(inverses):
         covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += inverse
     lags, waves = (
-        np.sqrt(np.einsum("pi,ij,pj->p", one, covariance, one))
-        for one in _slopes(motion, np.array(sizes))
+        np.sqrt(np.einsum("pi,ij,pj->p", slope, covariance, slope))
+        for slope in _slopes(motion, np.array(sizes))
     )
     return {
         "frequency": noise * np.array([information**-0.5]),
@@ -192,14 +192,14 @@ def bound(motion, cycles, noise):
 def _slopes(motion, amplitudes):
     """Return the derivatives of lags and of wave numbers by Re a and Im a, joint after joint."""
     step = 1e-6
-    found = []
+    slopes = []
     for k in range(amplitudes.size):
         for way in (1.0, 1j):
             off = np.zeros_like(amplitudes)
             off[k] = step * way
             ends = [_lags_and_waves(motion, amplitudes + sign * off) for sign in (1, -1)]
-            found.append([(up - down) / (2 * step) for up, down in zip(*ends, strict=True)])
-    return [np.stack([row[part] for row in found], axis=1) for part in (0, 1)]
+            slopes.append([(up - down) / (2 * step) for up, down in zip(*ends, strict=True)])
+    return [np.stack([row[part] for row in slopes], axis=1) for part in (0, 1)]
 
 
 def _lags_and_waves(motion, amplitudes):
@@ -219,15 +219,15 @@ def _lags_and_waves(motion, amplitudes):
 def coverage(motion, cycles, draws, *, noise=NOISE, seed=1):
     """Judge the intervals of many draws of the noise."""
     random = np.random.default_rng([cycles, seed])
-    known, least = truth(motion, cycles), bound(motion, cycles, noise)
+    expected, least = truth(motion, cycles), bound(motion, cycles, noise)
     inside = {name: [] for name in QUANTITIES}
     width = {name: [] for name in QUANTITIES}
     for _ in range(draws):
         series = foreign(motion, cycles, random, noise)
-        found = measure(motion.robot, series, cycles / FREQUENCY_HZ)
+        measured = measure(motion.robot, series, cycles / FREQUENCY_HZ)
         for name in QUANTITIES:
-            ends = np.array([ends for _, ends in found[name]])
-            inside[name].append((ends[:, 0] <= known[name]) & (known[name] <= ends[:, 1]))
+            ends = np.array([ends for _, ends in measured[name]])
+            inside[name].append((ends[:, 0] <= expected[name]) & (expected[name] <= ends[:, 1]))
             width[name].append((ends[:, 1] - ends[:, 0]) / (2 * 1.96 * least[name]))
     return Coverage(
         {name: float(np.mean(parts)) for name, parts in inside.items()},
@@ -238,15 +238,17 @@ def coverage(motion, cycles, draws, *, noise=NOISE, seed=1):
 def lasting(motions, whole, cycles):
     """Return the shares of windows whose intervals hold the values of all runs together."""
     random = np.random.default_rng(cycles)
-    known = [truth(motion, whole) for motion in motions]
+    expected = [truth(motion, whole) for motion in motions]
     inside = {name: [] for name in QUANTITIES}
     for motion in motions:
         for first in range(0, whole - cycles + 1, cycles):
             part = replace(motion, t_s=motion.t_s - first / FREQUENCY_HZ)
-            found = measure(part.robot, foreign(part, cycles, random, NOISE), cycles / FREQUENCY_HZ)
+            measured = measure(
+                part.robot, foreign(part, cycles, random, NOISE), cycles / FREQUENCY_HZ
+            )
             for name in QUANTITIES:
-                value = np.mean([one[name] for one in known], axis=0)
-                ends = np.array([ends for _, ends in found[name]])
+                value = np.mean([motion_values[name] for motion_values in expected], axis=0)
+                ends = np.array([ends for _, ends in measured[name]])
                 inside[name].append((ends[:, 0] <= value) & (value <= ends[:, 1]))
     return {name: float(np.mean(parts)) for name, parts in inside.items()}
 
@@ -255,14 +257,17 @@ def main():
     """Print the table; with ``--quick`` of few draws."""
     quick = "--quick" in sys.argv
     draws, lengths = (10, CYCLES[:1]) if quick else (200, CYCLES)
-    print("| gait | cycles | " + " | ".join(f"{one} | width" for one in QUANTITIES) + " |")
+    print(
+        "| gait | cycles | " + " | ".join(f"{quantity} | width" for quantity in QUANTITIES) + " |"
+    )
     print("|---" * 8 + "|")
     for name, (servo, tables) in GAITS.items():
         (motion,) = twin_motions(servo, tables, max(lengths))
         for cycles in lengths:
-            found = coverage(motion, cycles, draws)
+            result = coverage(motion, cycles, draws)
             cells = " | ".join(
-                f"{100 * found.inside[one]:.1f} % | {found.width[one]:.2f}" for one in QUANTITIES
+                f"{100 * result.inside[quantity]:.1f} % | {result.width[quantity]:.2f}"
+                for quantity in QUANTITIES
             )
             print(f"| {name} | {cycles} | {cells} |", flush=True)
     runs, whole = (2, 18) if quick else (8, 390)
@@ -272,8 +277,11 @@ def main():
     print("|---" * 4 + "|")
     motions = twin_motions(*GAITS[name], whole, runs)
     for cycles in lengths:
-        found = lasting(motions, whole, cycles)
-        print(f"| {cycles} | {' | '.join(f'{found[one]:.0%}' for one in QUANTITIES)} |", flush=True)
+        result = lasting(motions, whole, cycles)
+        print(
+            f"| {cycles} | {' | '.join(f'{result[quantity]:.0%}' for quantity in QUANTITIES)} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

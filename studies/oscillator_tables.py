@@ -34,15 +34,15 @@ def print_chain(m, stall):
         print("\n".join(f"  {line}" for line in coupling_lines(experiment.coupling)))
         print(f"  {experiment.oscillators.answer}")
         ratio = closed_loop.base_response(experiment)
-        found = closed_loop.closed_loop(folder, experiment.coupling, ratio)
-        print(f"  closed loop, eps {closed_loop.EPS}, {found.t_s[-1]:.1f} s after a kick:")
-        print(f"    moved by {found.moved[-1]:.1%} of it; prediction off by {found.error[-1]:.1%}")
-        print(f"    of it, at most {found.error.max():.1%}", flush=True)
+        run = closed_loop.closed_loop(folder, experiment.coupling, ratio)
+        print(f"  closed loop, eps {closed_loop.EPS}, {run.t_s[-1]:.1f} s after a kick:")
+        print(f"    moved by {run.moved[-1]:.1%} of it; prediction off by {run.error[-1]:.1%}")
+        print(f"    of it, at most {run.error.max():.1%}", flush=True)
 
 
 def coupling_lines(coupling):
     """What there is to say of P and R."""
-    P, R = (np.array(one.value) for one in (coupling.P, coupling.R))
+    P, R = (np.array(estimate.value) for estimate in (coupling.P, coupling.R))
     diagonal = np.diag(P)
     yield f"P, diagonal: {np.round(diagonal, 3)}"
     yield f"  ends {diagonal[[0, -1]].mean():.3f}, inside {diagonal[1:-1].mean():.3f}"
@@ -51,16 +51,16 @@ def coupling_lines(coupling):
     yield f"  next joint headwards {np.round(np.diag(P, -1), 3)}"
     yield f"  ||I - P|| {np.linalg.norm(np.eye(len(P)) - P):.3f}"
     yield f"rows: P to {abs(P.sum(axis=1) - 1).max():.1e}, R to {abs(R.sum(axis=1)).max():.1e}"
-    for one in coupling.held_out:
-        better = one.error_kept / one.error
+    for pattern in coupling.held_out:
+        better = pattern.error_kept / pattern.error
         yield (
-            f"held out {one.size:.3f} rad: {one.error:.2%}, kept {one.error_kept:.2%}, "
+            f"held out {pattern.size:.3f} rad: {pattern.error:.2%}, kept {pattern.error_kept:.2%}, "
             f"{better:.1f} times better"
         )
     for label, matrix in (("P", P), ("homogeneous", homogeneous(P))):
-        found = spectrum(matrix)
-        rates = np.round(found.rates, 3)
-        yield f"{label}: slowest {found.gap:+.4f}, strong {found.strong}, rates {rates}"
+        modes = spectrum(matrix)
+        rates = np.round(modes.rates, 3)
+        yield f"{label}: slowest {modes.gap:+.4f}, strong {modes.strong}, rates {rates}"
 
 
 def main():

@@ -132,11 +132,11 @@ def _read(session: Session, world: World) -> Run:
 
 def draw_world(ax: Axes, world: World) -> None:
     """Obstacles and target from above."""
-    for one in world.obstacles:
-        if isinstance(one, Cylinder):
-            ax.add_patch(Circle(one.position, one.radius, color=STONE))
+    for obstacle in world.obstacles:
+        if isinstance(obstacle, Cylinder):
+            ax.add_patch(Circle(obstacle.position, obstacle.radius, color=STONE))
             continue
-        box = one.box if isinstance(one, Wall) else one
+        box = obstacle.box if isinstance(obstacle, Wall) else obstacle
         c, s = math.cos(box.heading), math.sin(box.heading)
         half = np.array(box.size) / 2 * [[1, 1], [-1, 1], [-1, -1], [1, -1]]
         ax.add_patch(Polygon(half @ [[c, s], [-s, c]] + box.position, color=STONE))
@@ -158,10 +158,10 @@ def draw_body(ax: Axes, run: Run, time_s: float, across: int = 1, **look: Any) -
 def shade_modes(ax: Axes, run: Run) -> None:
     """The gait's mode behind a plot over time."""
     ends = [*[time for time, _ in run.modes[1:]], float(run.t_s[-1])]
-    said: set[str] = set()
+    labelled: set[str] = set()
     for (start, mode), end in zip(run.modes, ends, strict=True):
-        label = None if mode in said else mode
-        said.add(mode)
+        label = None if mode in labelled else mode
+        labelled.add(mode)
         ax.axvspan(start, end, color=MODES.get(mode, OTHER_MODE), lw=0, label=label, zorder=0)
 
 

@@ -83,17 +83,21 @@ def values(folder: Path) -> dict[str, str]:
     """Return what the page's places are filled with."""
     results = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
     arm = {joint["name"]: joint for joint in results["so101"]["joints"]}
-    jaw = next(one for one in results["so101"]["artefacts"] if one["flag"] == "scale_mismatch")
+    jaw = next(
+        artefact
+        for artefact in results["so101"]["artefacts"]
+        if artefact["flag"] == "scale_mismatch"
+    )
     tested = results["multisine"]["frequency_response"]
-    halves = [one["halves_agree"] for one in tested]
+    halves = [response["halves_agree"] for response in tested]
     legs, (bus,) = results["go2"]["frequency_response"], results["bus"]["frequency_response"]
     filled = {
         "gait": f"{results['so101']['gait']['frequency_hz']:.4f}",
         "jaw": jaw["note"].split()[0],
-        "multisine": table(response_row(one) for one in tested),
-        "agreed": str(sum(one[0] for one in halves)),
-        "of": str(sum(one[1] for one in halves)),
-        "legs": table(response_row(one) for one in legs),
+        "multisine": table(response_row(response) for response in tested),
+        "agreed": str(sum(pair[0] for pair in halves)),
+        "of": str(sum(pair[1] for pair in halves)),
+        "legs": table(response_row(response) for response in legs),
         "bus": row(response_row(bus)),
         "arm": table(arm_row(arm[name]) for name in arm),
         "first": results["so101"]["answer"]["sentence"],
@@ -115,7 +119,7 @@ def amplitude(result: dict[str, Any]) -> float:
 
 def interval(value: float, ends: Any, factor: float, digits: int) -> str:
     """Return a value with its interval."""
-    low, high = (f"{factor * one:.{digits}f}" for one in ends)
+    low, high = (f"{factor * end:.{digits}f}" for end in ends)
     return f"{factor * value:.{digits}f} [{low}, {high}]"
 
 
@@ -146,14 +150,14 @@ def arm_row(joint: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def response_row(one: dict[str, Any]) -> tuple[str, ...]:
+def response_row(response: dict[str, Any]) -> tuple[str, ...]:
     """Return name, band, gain at its ends, bandwidth and delay of a frequency response."""
-    band = f"{one['frequency_hz'][0]:.2f} to {one['frequency_hz'][-1]:.2f}"
-    ends = f"{one['gain'][0]:.3f} to {one['gain'][-1]:.3f}"
-    width = "–" if one["bandwidth_hz"] is None else f"{one['bandwidth_hz']:.2f}"
-    delay = interval(one["delay_s"], one["delay_s_ci95"], 1e3, 1)
-    spread = "–" if one["distortion"] is None else f"{100 * one['distortion']:.1f}"
-    return one["joint"], band, ends, width, delay, spread
+    band = f"{response['frequency_hz'][0]:.2f} to {response['frequency_hz'][-1]:.2f}"
+    ends = f"{response['gain'][0]:.3f} to {response['gain'][-1]:.3f}"
+    width = "–" if response["bandwidth_hz"] is None else f"{response['bandwidth_hz']:.2f}"
+    delay = interval(response["delay_s"], response["delay_s_ci95"], 1e3, 1)
+    spread = "–" if response["distortion"] is None else f"{100 * response['distortion']:.1f}"
+    return response["joint"], band, ends, width, delay, spread
 
 
 def main() -> None:

@@ -78,19 +78,19 @@ def times(
 
 def table(chains: list[Kicked], *, draws: int = DRAWN, longest: float = LONGEST) -> pd.DataFrame:
     """Return one row a chain and kind: gap, times, share of synchronous chains, order over time."""
-    found = []
-    for one in chains:
+    rows = []
+    for chain in chains:
         for kind in KINDS:
-            M = coupling(kind, one.P)
+            M = coupling(kind, chain.P)
             took, seen = times(M, draws, longest if "path" in kind else longest / 4)
             zero = np.zeros(1)
-            found.append(
+            rows.append(
                 {
-                    "n": one.n,
-                    "stall": one.stall,
+                    "n": chain.n,
+                    "stall": chain.stall,
                     "kind": kind,
                     "gap": spectrum(M).gap,
-                    "oracle": 4.0 * PATH * np.sin(np.pi / (2 * one.n)) ** 2,
+                    "oracle": 4.0 * PATH * np.sin(np.pi / (2 * chain.n)) ** 2,
                     "times": took,
                     "median": float(np.median(took)),
                     "synchronous": float(np.isfinite(took).mean()),
@@ -98,10 +98,10 @@ def table(chains: list[Kicked], *, draws: int = DRAWN, longest: float = LONGEST)
                     "detuned": 1.0 / float(smallest_singular(M, zero, zero)[0, 0]),
                 }
             )
-    return pd.DataFrame(found)
+    return pd.DataFrame(rows)
 
 
-def growth_with_n(found: pd.DataFrame) -> pd.DataFrame:
+def growth_with_n(frame: pd.DataFrame) -> pd.DataFrame:
     """Return exponents in n of time to synchrony, slowest rate and detuning, by stall and kind.
 
     The time is the median over the chains' starts, its interval by bootstrap over them; all kinds
@@ -109,12 +109,12 @@ def growth_with_n(found: pd.DataFrame) -> pd.DataFrame:
     which more than half of the chains never became synchronous have neither.
     """
     rows = []
-    for (stall, kind), group in found.groupby(["stall", "kind"], sort=False):
+    for (stall, kind), group in frame.groupby(["stall", "kind"], sort=False):
         logs = np.log(group["n"].to_numpy(dtype=float))
         if len(logs) < 2:
             continue
         drawn = _exponents(logs, group["times"].to_list())
-        path = _exponents(logs, found.loc[group.index - KINDS.index(kind), "times"].to_list())
+        path = _exponents(logs, frame.loc[group.index - KINDS.index(kind), "times"].to_list())
         rows.append(
             {
                 "stall": stall,
@@ -133,10 +133,12 @@ def growth_with_n(found: pd.DataFrame) -> pd.DataFrame:
 def _exponents(logs: FloatArray, times_of: list[FloatArray]) -> FloatArray:
     """Return exponents of the median time: that of all starts first, then those of resamples."""
     random = np.random.default_rng(6)
-    medians = [[np.median(one) for one in times_of]]
+    medians = [[np.median(durations) for durations in times_of]]
     for _ in range(RESAMPLES):
-        picks = [one[random.integers(0, len(one), len(one))] for one in times_of]
-        medians.append([np.median(one) for one in picks])
+        picks = [
+            durations[random.integers(0, len(durations), len(durations))] for durations in times_of
+        ]
+        medians.append([np.median(pick) for pick in picks])
     if not np.isfinite(medians).all():
         return np.full(1 + RESAMPLES, np.nan)
     return np.polyfit(logs, np.log(medians).T, 1)[0]

@@ -88,16 +88,16 @@ def _worst(
 def _explicit(results: Results) -> Sequence[float]:
     """Explicit coupling that weak servos need, over that of a chain without a body; longest."""
     table = results.measures
-    one = table[table["stall"] == 0.25].sort_values("n").iloc[-1]
-    ends = one[["explicit", "explicit_low", "explicit_high"]].to_numpy(dtype=float)
-    return (ends / one["explicit_alone"]).tolist()
+    longest = table[table["stall"] == 0.25].sort_values("n").iloc[-1]
+    ends = longest[["explicit", "explicit_low", "explicit_high"]].to_numpy(dtype=float)
+    return (ends / longest["explicit_alone"]).tolist()
 
 
 def _time_exponent(kind: str, part: str = "") -> Callable[[Results], Sequence[float]]:
     def of(results: Results) -> Sequence[float]:
         table = results.growth
-        one = table[(table["stall"] == 0.25) & (table["kind"] == kind)].iloc[0]
-        return [float(one[f"{part}{end}"]) for end in ("value", "low", "high")]
+        row = table[(table["stall"] == 0.25) & (table["kind"] == kind)].iloc[0]
+        return [float(row[f"{part}{end}"]) for end in ("value", "low", "high")]
 
     return of
 
@@ -110,9 +110,9 @@ def _heterogeneity(results: Results) -> Sequence[float]:
     if table["n"].max() < LONG:
         return np.nan, np.nan, np.nan
     pick = np.random.default_rng(7).integers(0, both.shape[1], (DRAWS, both.shape[1]))
-    one, other = np.median(both[:, pick], axis=2)
+    identified, homogeneous = np.median(both[:, pick], axis=2)
     value = np.median(both[0]) / np.median(both[1])
-    return float(value), *np.quantile(one / other, (0.025, 0.975)).tolist()
+    return float(value), *np.quantile(identified / homogeneous, (0.025, 0.975)).tolist()
 
 
 def _beyond_a_wave(results: Results) -> Sequence[float]:
@@ -121,9 +121,9 @@ def _beyond_a_wave(results: Results) -> Sequence[float]:
     table = table[table["n"] >= 9]
     if len(table) < 3:
         return np.nan, np.nan, np.nan
-    found = linregress(np.log(table["n"]), np.log(table["lag_sd"]))
-    half = float(stdtrit(len(table) - 2, 0.975) * found.stderr)
-    return found.slope, found.slope - half, found.slope + half
+    fit = linregress(np.log(table["n"]), np.log(table["lag_sd"]))
+    half = float(stdtrit(len(table) - 2, 0.975) * fit.stderr)
+    return fit.slope, fit.slope - half, fit.slope + half
 
 
 def _rough_across(results: Results) -> Sequence[float]:
@@ -169,11 +169,11 @@ CONCLUSIONS = tuple(
 
 def evaluate(results: Results) -> list[Verdict]:
     """Return all conclusions, evaluated."""
-    return [_verdict(one, results) for one in CONCLUSIONS]
+    return [_verdict(conclusion, results) for conclusion in CONCLUSIONS]
 
 
-def _verdict(one: Conclusion, results: Results) -> Verdict:
-    value, low, high = (float(x) for x in OF[one.name](results))
-    holds = low > one.bound if one.above else high < one.bound
+def _verdict(conclusion: Conclusion, results: Results) -> Verdict:
+    value, low, high = (float(x) for x in OF[conclusion.name](results))
+    holds = low > conclusion.bound if conclusion.above else high < conclusion.bound
     too_few = not np.isfinite([low, high]).all()
-    return Verdict(one, value, low, high, None if too_few else bool(holds))
+    return Verdict(conclusion, value, low, high, None if too_few else bool(holds))

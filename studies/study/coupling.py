@@ -58,13 +58,13 @@ class Kicked:
 
 def kicked(rows: pd.DataFrame) -> list[Kicked]:
     """Return the matrices of all chains whose kicks are complete."""
-    found = []
+    chains = []
     for plan, group in rows[rows["plan"].str.startswith("kicks-")].groupby("plan"):
         _, n, stall = str(plan).split("-")
         done = group[(group["status"] == "done") & (group["n"] == int(n))]
-        one = _matrices(done, int(n), float(stall))
-        found += [] if one is None else [one]
-    return sorted(found, key=lambda one: (one.stall, one.n))
+        chain = _matrices(done, int(n), float(stall))
+        chains += [] if chain is None else [chain]
+    return sorted(chains, key=lambda kept: (kept.stall, kept.n))
 
 
 def _matrices(rows: pd.DataFrame, n: int, stall: float) -> Kicked | None:
@@ -81,9 +81,9 @@ def _matrices(rows: pd.DataFrame, n: int, stall: float) -> Kicked | None:
     P, R = np.eye(n) + slope.imag, slope.real
     defect = P.sum(axis=1) - 1.0
     ratios = []
-    for phase, one in y.items():
+    for phase, response in y.items():
         if np.count_nonzero(phase) >= 2 and max(np.abs(phase)) <= HELD_OUT:
-            moved = (one - base).imag + np.array(phase)
+            moved = (response - base).imag + np.array(phase)
             kept, predicted = np.array(phase), P @ np.array(phase)
             ratios.append(np.linalg.norm(moved - predicted) / np.linalg.norm(moved - kept))
     base_key = rows["key"].iloc[int(np.flatnonzero(~turned.any(axis=1))[0])]
@@ -143,26 +143,26 @@ def amplification(P: FloatArray) -> float:
 
 def measures(chains: list[Kicked]) -> pd.DataFrame:
     """Return one row a chain with what the page prints, NAME_low and NAME_high where drawn."""
-    return pd.DataFrame([_measures(one) for one in chains])
+    return pd.DataFrame([_measures(chain) for chain in chains])
 
 
-def _explicit(one: Kicked) -> dict[str, float]:
+def _explicit(chain: Kicked) -> dict[str, float]:
     """Return the path's coupling that lifts all rates to ``STRONG``, with this body and others."""
-    drawn = [explicit_coupling(P) for P in one.drawn()[:EXPLICIT_DRAWS]]
+    drawn = [explicit_coupling(P) for P in chain.drawn()[:EXPLICIT_DRAWS]]
     low, high = np.quantile(drawn, (0.025, 0.975))
-    value = explicit_coupling(one.P)
+    value = explicit_coupling(chain.P)
     return {
         "explicit": value,
         "explicit_low": min(low, value),
         "explicit_high": max(high, value),
-        "explicit_homogeneous": explicit_coupling(homogeneous(one.P)),
-        "explicit_alone": STRONG / (4.0 * np.sin(np.pi / (2 * one.n)) ** 2),
+        "explicit_homogeneous": explicit_coupling(homogeneous(chain.P)),
+        "explicit_alone": STRONG / (4.0 * np.sin(np.pi / (2 * chain.n)) ** 2),
     }
 
 
-def _measures(one: Kicked) -> dict[str, float | str]:
-    found, ends = spectrum(one.P), intervals_of(one.P, one.drawn())
-    other = spectrum(homogeneous(one.P))
+def _measures(chain: Kicked) -> dict[str, float | str]:
+    modes, ends = spectrum(chain.P), intervals_of(chain.P, chain.drawn())
+    other = spectrum(homogeneous(chain.P))
     zero = np.zeros(1)
     quantities = {
         "henrici": henrici,
@@ -171,26 +171,26 @@ def _measures(one: Kicked) -> dict[str, float | str]:
         "band3": lambda P: band_energy(P, 3),
         "size": lambda P: float(np.linalg.norm(np.eye(len(P)) - P)),
     }
-    row: dict[str, float | str] = {"n": one.n, "stall": one.stall, "key": one.key}
+    row: dict[str, float | str] = {"n": chain.n, "stall": chain.stall, "key": chain.key}
     for name, of in quantities.items():
-        drawn = [of(P) for P in one.drawn()]
+        drawn = [of(P) for P in chain.drawn()]
         low, high = np.quantile(drawn, (0.025, 0.975))
-        value = of(one.P)
+        value = of(chain.P)
         row |= {name: value, f"{name}_low": min(low, value), f"{name}_high": max(high, value)}
     return row | {
-        "gap": found.gap,
+        "gap": modes.gap,
         "gap_low": ends.gap.ci95[0],
         "gap_high": ends.gap.ci95[1],
-        "strong": found.strong,
+        "strong": modes.strong,
         "homogeneous_gap": other.gap,
         "homogeneous_strong": other.strong,
-        **_explicit(one),
-        "growth": growth(one.P),
-        "amplification": amplification(one.P),
-        "reach90": reach_of(one.P),
-        "noise_level": float(smallest_singular(one.P, zero, zero)[0, 0]),
-        "diagonal_ends": float(np.diag(one.P)[[0, -1]].mean()),
-        "diagonal_inside": float(np.diag(one.P)[1:-1].mean()),
-        "row_defect": float(np.abs(one.P.sum(axis=1) - 1.0).max()),
-        "held_out": one.held_out,
+        **_explicit(chain),
+        "growth": growth(chain.P),
+        "amplification": amplification(chain.P),
+        "reach90": reach_of(chain.P),
+        "noise_level": float(smallest_singular(chain.P, zero, zero)[0, 0]),
+        "diagonal_ends": float(np.diag(chain.P)[[0, -1]].mean()),
+        "diagonal_inside": float(np.diag(chain.P)[1:-1].mean()),
+        "row_defect": float(np.abs(chain.P.sum(axis=1) - 1.0).max()),
+        "held_out": chain.held_out,
     }

@@ -56,7 +56,7 @@ def stages(*, quick: bool) -> Iterator[Stage]:
     if quick:
         named = ("sobol", "pair-ground", "pair-free", "reversal-forward", "reversal-back", *SLICED)
         yield from (Stage(name, _quick(name)) for name in named)
-        yield from (replace(one, plan=_short(one.plan)) for one in kicked[:4])
+        yield from (replace(stage, plan=_short(stage.plan)) for stage in kicked[:4])
         return
     yield from kicked[:4]
     yield _part("sobol", 32)
@@ -84,7 +84,7 @@ def kicks(n: int, stall: float) -> SweepPlan:
         parameters=(
             Parameter(JOINTS, (2 * n - 1,)),
             Parameter("servo.stall_torque", (stall,)),
-            Parameter(PHASES, tuple((one + 0.0).tolist() for one in phases)),
+            Parameter(PHASES, tuple((phase + 0.0).tolist() for phase in phases)),
         ),
     )
 
@@ -100,15 +100,21 @@ def _quick(name: str) -> SweepPlan:
     if name in SLICED:
         longest = QUICK_JOINTS[-1:]
         fewer = tuple(
-            replace(one, values=longest if one.key == JOINTS else (one.values[0], one.values[-1]))
-            for one in plan.parameters
+            replace(
+                parameter,
+                values=longest
+                if parameter.key == JOINTS
+                else (parameter.values[0], parameter.values[-1]),
+            )
+            for parameter in plan.parameters
         )
         joints = (Parameter(JOINTS, longest),) if name == "slice-servo" else ()
         if name == "slice-joints":
             fewer = (Parameter(JOINTS, QUICK_JOINTS),)
         return replace(plan, parameters=(*fewer, *joints))
     short = tuple(
-        replace(one, values=QUICK_JOINTS) if one.key == JOINTS else one for one in plan.parameters
+        replace(parameter, values=QUICK_JOINTS) if parameter.key == JOINTS else parameter
+        for parameter in plan.parameters
     )
     return replace(plan, points=QUICK_POINTS[name.partition("-")[0]], parameters=short)
 

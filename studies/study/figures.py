@@ -47,8 +47,8 @@ LENGTHS = (3, 5, 9, 13, 17, 25, 50)
 
 def log_axis(axis: Axis, ticks: Sequence[float]) -> None:
     """Make an axis logarithmic, with ticks at these values alone."""
-    one = axis.axes
-    (one.set_xscale if axis is one.xaxis else one.set_yscale)("log")
+    ax = axis.axes
+    (ax.set_xscale if axis is ax.xaxis else ax.set_yscale)("log")
     axis.set_major_locator(FixedLocator(list(ticks)))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.set_minor_locator(NullLocator())
@@ -131,7 +131,7 @@ def collapse(results: Results) -> Figure:
 def _decades(values: FloatArray) -> list[float]:
     """Return 1, 2, 5, 10, ... within the values' range."""
     every = [m * 10.0**k for k in range(-5, 5) for m in (1, 2, 5)]
-    return [one for one in every if values.min() <= one <= values.max()]
+    return [tick for tick in every if values.min() <= tick <= values.max()]
 
 
 def shares(results: Results) -> Figure:
@@ -155,26 +155,26 @@ def shares(results: Results) -> Figure:
 
 def matrices(results: Results) -> Figure:
     """P - I of each chain of weak servos, and the reach of its coupling."""
-    weak = [one for one in results.kicked if one.stall == 0.25]
+    weak = [candidate for candidate in results.kicked if candidate.stall == 0.25]
     figure, axes = plt.subplots(1, len(weak) + 1, figsize=(2.6 * len(weak) + 3.2, 2.9))
-    for ax, one in zip(axes, weak, strict=False):
+    for ax, chain in zip(axes, weak, strict=False):
         ax.spines[:].set_visible(True)
         shown = ax.imshow(
-            one.P - np.eye(one.n),
+            chain.P - np.eye(chain.n),
             cmap="RdBu_r",
             vmin=-0.25,
             vmax=0.25,
-            extent=(0.5, one.n + 0.5, one.n + 0.5, 0.5),
+            extent=(0.5, chain.n + 0.5, chain.n + 0.5, 0.5),
         )
-        ax.set_title(f"P − I, n = {one.n}", fontsize=9)
+        ax.set_title(f"P − I, n = {chain.n}", fontsize=9)
         ax.set_xlabel("command turned")
     axes[0].set_ylabel("joint")
     figure.colorbar(shown, ax=axes[len(weak) - 1])
-    for one in results.kicked:
-        reach = np.arange(1, one.n)
-        style = "o-" if one.stall == 0.25 else "s--"
-        energy = [band_energy(one.P, int(k)) for k in reach]
-        axes[-1].plot(reach, energy, style, ms=3, label=f"n = {one.n}, {one.stall:g} N m")
+    for chain in results.kicked:
+        reach = np.arange(1, chain.n)
+        style = "o-" if chain.stall == 0.25 else "s--"
+        energy = [band_energy(chain.P, int(k)) for k in reach]
+        axes[-1].plot(reach, energy, style, ms=3, label=f"n = {chain.n}, {chain.stall:g} N m")
     log_axis(axes[-1].xaxis, (1, 2, 4, 8, 16, 32))
     axes[-1].set(xlabel="within |i − j|", ylabel="share of off-diagonal energy")
     axes[-1].legend(frameon=False, fontsize=7)
@@ -183,24 +183,26 @@ def matrices(results: Results) -> Figure:
 
 def modes(results: Results) -> Figure:
     """Pseudospectrum and slowest pattern of the longest chain of weak servos."""
-    one = max((k for k in results.kicked if k.stall == 0.25), key=lambda k: k.n)
+    chain = max((k for k in results.kicked if k.stall == 0.25), key=lambda k: k.n)
     figure, (ax, beside) = plt.subplots(1, 2, figsize=(9, 3.4))
-    values = np.linalg.eigvals(of_deviations(one.P))
+    values = np.linalg.eigvals(of_deviations(chain.P))
     real = np.linspace(values.real.min() - 0.15, values.real.max() + 0.15, 81)
     top = float(np.abs(values.imag).max()) + 0.15
     imag = np.linspace(-top, top, 81)
-    level = np.log10(smallest_singular(one.P, real, imag)).T
+    level = np.log10(smallest_singular(chain.P, real, imag)).T
     lines = ax.contour(real, imag, level, levels=np.arange(-4.0, 0.0, 0.5), cmap="viridis")
     ax.clabel(lines, fontsize=7)
     ax.plot(values.real, values.imag, "k.", ms=6)
     ax.axvline(0.0, color="#8c8c8c", lw=0.8)
     ax.set(xlabel="real part of the rate [ε]", ylabel="imaginary part [ε]")
-    ax.set_title(f"log10 of the change of P that makes it a rate, n = {one.n}", fontsize=9)
-    found = spectrum(one.P)
-    for k in np.flatnonzero(found.rates.imag >= 0.0)[:3]:
-        pattern = found.patterns[:, k]
+    ax.set_title(f"log10 of the change of P that makes it a rate, n = {chain.n}", fontsize=9)
+    decomposition = spectrum(chain.P)
+    for k in np.flatnonzero(decomposition.rates.imag >= 0.0)[:3]:
+        pattern = decomposition.patterns[:, k]
         pattern = (pattern / pattern[np.argmax(np.abs(pattern))]).real
-        beside.plot(np.arange(1, one.n + 1), pattern, "o-", label=f"{found.rates[k]:.3f} ε")
+        beside.plot(
+            np.arange(1, chain.n + 1), pattern, "o-", label=f"{decomposition.rates[k]:.3f} ε"
+        )
     beside.set(xlabel="joint, from the head", ylabel="pattern, largest = 1")
     beside.legend(frameon=False, fontsize=8)
     return figure
@@ -219,8 +221,8 @@ def synchrony(results: Results) -> Figure:
     first.set_title(f"n = {int(weak['n'].max())}", fontsize=9)
     first.legend(frameon=False, fontsize=7)
     for kind in KINDS[:3]:
-        one = weak[weak["kind"] == kind].sort_values("n")
-        second.plot(one["n"], one["median"], "o-", color=COLOURS[kind], label=kind)
+        rows = weak[weak["kind"] == kind].sort_values("n")
+        second.plot(rows["n"], rows["median"], "o-", color=COLOURS[kind], label=kind)
     log_axis(second.xaxis, LENGTHS)
     log_axis(second.yaxis, _decades(weak.loc[weak["kind"] == "path", "median"].to_numpy()))
     second.set(xlabel="n", ylabel="median time to synchrony [1/ε]")

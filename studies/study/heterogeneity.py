@@ -33,8 +33,8 @@ LAWS = ("box", "transeth")
 
 def settled(rows: pd.DataFrame, plan: str) -> pd.DataFrame:
     """Return the rows of a sweep that are done, settled and have a spread."""
-    found = rows[(rows["plan"] == plan) & (rows["status"] == "done")]
-    return found[(found["drift"] <= MOST_DRIFT) & (found["lag_sd"] > 0.0) & (found["gain_cv"] > 0)]
+    done = rows[(rows["plan"] == plan) & (rows["status"] == "done")]
+    return done[(done["drift"] <= MOST_DRIFT) & (done["lag_sd"] > 0.0) & (done["gain_cv"] > 0)]
 
 
 def contact_points(rows: pd.DataFrame) -> pd.DataFrame:
@@ -154,12 +154,12 @@ def foretold(points: pd.DataFrame) -> FloatArray:
 
     The group was made up when ``KNOWN`` points had been run, and the model is fitted to these.
     """
-    known = {
+    early_points = {
         json.dumps(point, sort_keys=True)
         for name, count in KNOWN.items()
         for point in points_of(replace(read_plan(PLANS / f"{name}.toml"), points=count))
     }
-    early = points["changes"].isin(known).to_numpy()
+    early = points["changes"].isin(early_points).to_numpy()
     if min(early.sum(), (~early).sum()) < FEWEST:
         return np.full(3, np.nan)
     y = np.log(points["lag_sd"].to_numpy())
@@ -195,8 +195,8 @@ def held_out(models: list[FloatArray], y: FloatArray, folds: int = 10) -> FloatA
         train = fold != k
         fits = [np.linalg.lstsq(X[train], y[train], rcond=None)[0] for X in models]
         left = [np.sum((y[train] - X[train] @ b) ** 2) for X, b in zip(models, fits, strict=True)]
-        one = int(np.argmin(left))
-        error[~train] = y[~train] - models[one][~train] @ fits[one]
+        best = int(np.argmin(left))
+        error[~train] = y[~train] - models[best][~train] @ fits[best]
         spread[~train] = y[~train] - y[train].mean()
     return _explained(error, spread)
 
@@ -207,21 +207,21 @@ def shares(rows: pd.DataFrame) -> pd.DataFrame:
     The twin has no noise here, so one run each way is the mean.
     """
     both = _paired(rows, "reversal-forward", "reversal-back")
-    found = []
-    for one, other in zip(responses(both[0]), responses(both[1]), strict=True):
-        parts = variance_shares(np.stack([one, one]), np.stack([other, other]))
-        d = one - other[::-1]
+    records = []
+    for forward, back in zip(responses(both[0]), responses(both[1]), strict=True):
+        parts = variance_shares(np.stack([forward, forward]), np.stack([back, back]))
+        d = forward - back[::-1]
         contrast = np.abs(d - d[::-1])[: len(d) // 2]
-        found.append(
+        records.append(
             {
-                "n": len(one),
+                "n": len(forward),
                 "boundary_share": 1.0 - (parts.module_share.value or 0.0),
                 "module_variance": parts.module_variance,
                 "mismatch": float(np.abs(d).max()),
                 "named": int(np.argmax(contrast)) == 1,  # joint03 is the second yaw joint
             }
         )
-    table = pd.DataFrame(found)
+    table = pd.DataFrame(records)
     return table.assign(
         **{name: both[0][name].to_numpy() for name in ("weakened", "stall_torque", "lag_sd", "key")}
     )
@@ -239,14 +239,14 @@ SHORT = 9
 """Yaw joints up to which bending modes lie above the design's gaits."""
 
 
-def short_ratio(found: pd.DataFrame) -> FloatArray:
+def short_ratio(table: pd.DataFrame) -> FloatArray:
     """Return the median ratio of chains up to ``SHORT`` joints, with its interval, shape (3,)."""
-    return bootstrapped(found.loc[found["n"] <= SHORT, "ratio"].to_numpy())
+    return bootstrapped(table.loc[table["n"] <= SHORT, "ratio"].to_numpy())
 
 
-def _paired(rows: pd.DataFrame, one: str, other: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+def _paired(rows: pd.DataFrame, first: str, other: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the settled rows of two sweeps over the same points, in the same order."""
-    a, b = (settled(rows, name).set_index("changes").sort_index() for name in (one, other))
+    a, b = (settled(rows, name).set_index("changes").sort_index() for name in (first, other))
     common = a.index.intersection(b.index)
     return a.loc[common].reset_index(), b.loc[common].reset_index()
 

@@ -85,19 +85,19 @@ STANDARD = Loop()
 def open_loop(case: Case) -> dict:
     """Kick the open loop; return P, R and the response with their errors, and the modes."""
     start = time.monotonic()
-    found = kick_coupling(_kicked(case), lambda _: None)
-    P, R = np.array(found.P.value), np.array(found.R.value)
-    J = np.eye(case.n) + relaxation(*_drawn(_measured(found)))
+    coupling = kick_coupling(_kicked(case), lambda _: None)
+    P, R = np.array(coupling.P.value), np.array(coupling.R.value)
+    J = np.eye(case.n) + relaxation(*_drawn(_measured(coupling)))
     here, ends = spectrum(J[0]), intervals_of(J[0], J[1:])
-    K = [explicit_coupling(one, RATE) for one in J[:21]]
+    K = [explicit_coupling(matrix, RATE) for matrix in J[:21]]
     return {
         "kind": "P",
         **asdict(case),
-        **_measured(found),
+        **_measured(coupling),
         "rows_P": float(np.abs(P.sum(axis=1) - 1).max()),
         "rows_R": float(np.abs(R.sum(axis=1)).max()),
-        "checks_pass": found.checks_pass,
-        "curvature": found.kick_size.curvature,
+        "checks_pass": coupling.checks_pass,
+        "curvature": coupling.kick_size.curvature,
         "rates": here.rates.real.tolist(),
         "slowest": here.gap,
         "slowest_low": ends.gap.ci95[0],
@@ -119,7 +119,7 @@ def _kicked(case: Case) -> KickExperiment:
     off = np.vstack([np.zeros(n), KICK * np.eye(n), -KICK * np.eye(n)])
     commands = wave * np.exp(1j * off)
     scenario = _scenario(case, SETTLE_S + MEASURE_S, "serpentine", {})
-    fits = [_fit(_run(scenario, Sines(one))[0]) for one in commands]
+    fits = [_fit(_run(scenario, Sines(command))[0]) for command in commands]
     response, variance = (np.array(part) for part in zip(*fits, strict=True))
     return KickExperiment(
         index=tuple(range(len(off))),
@@ -153,9 +153,9 @@ def _fit(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     used = t_s >= SETTLE_S
     turn = np.exp(1j * OMEGA * np.outer(t_s[used], (1, 2, 3)))
     parts = np.column_stack([np.ones(used.sum()), t_s[used], turn.imag, turn.real])
-    found, *_ = np.linalg.lstsq(parts, angles[used], rcond=None)
-    noise = np.var(angles[used] - parts @ found, axis=0)
-    response = found[2] + 1j * found[5]
+    coefficients, *_ = np.linalg.lstsq(parts, angles[used], rcond=None)
+    noise = np.var(angles[used] - parts @ coefficients, axis=0)
+    response = coefficients[2] + 1j * coefficients[5]
     return response, 2 * noise / used.sum() / np.abs(response) ** 2
 
 
@@ -176,43 +176,43 @@ def _measured(coupling) -> dict:
     }
 
 
-def _drawn(own: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _drawn(identified: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return P, R and g exp(j Delta), then draws of them within their errors."""
     P, R, P_error, R_error, correlation = (
-        np.array([list(row) for row in own[key]])
+        np.array([list(row) for row in identified[key]])
         for key in ("P", "R", "P_error", "R_error", "correlation")
     )
-    felt, n = _felt(own), len(P)
-    log_error = np.array(own["gain_error"]) / np.array(own["gain"])
+    felt, n = _felt(identified), len(P)
+    log_error = np.array(identified["gain_error"]) / np.array(identified["gain"])
     # The response to the gait is one more column: errors of one run, shared as those of the kicks.
-    own_error = np.concatenate([own["lag_error"], log_error])
+    own_error = np.concatenate([identified["lag_error"], log_error])
     error = np.column_stack([np.vstack([P_error, R_error]), own_error])
-    dof = np.full_like(error, float(own["dof"]))
+    dof = np.full_like(error, float(identified["dof"]))
     drawn = noise_draws(NoisyMatrix(np.zeros_like(error), error, dof, correlation), 61)
     drawn = np.concatenate([np.zeros((1, *error.shape)), drawn[:DRAWS]])
     turned = felt * np.exp(drawn[:, n:, n] + 1j * drawn[:, :n, n])
     return P + drawn[:, :n, :n], R + drawn[:, n:, :n], turned
 
 
-def _felt(own: dict) -> np.ndarray:
-    ratio = np.array(own["gain"]) * np.exp(-1j * np.array(own["lag"]))
+def _felt(identified: dict) -> np.ndarray:
+    ratio = np.array(identified["gain"]) * np.exp(-1j * np.array(identified["lag"]))
     return felt_response(ratio, OMEGA, AGE_S)
 
 
-def closed_loop(case: Case, loop: Loop, own: dict, patterns: int) -> list[dict]:
+def closed_loop(case: Case, loop: Loop, identified: dict, patterns: int) -> list[dict]:
     """Kick generators with feedback, and compare with what P and R foretell."""
-    P, R, felt = _drawn(own)
+    P, R, felt = _drawn(identified)
     links = loop.K * path_laplacian(case.n)
     J = loop.eps * (relaxation(P[0], R[0], felt[0]) - links)
-    free = _phases(case, loop, own, 0)
-    found = []
+    free = _phases(case, loop, identified, 0)
+    rows = []
     for seed in range(1, patterns + 1):
-        kicked = _phases(case, loop, own, seed)
+        kicked = _phases(case, loop, identified, seed)
         off = (kicked - free)[::TICKS]
         size = np.linalg.norm(_spread(off[0]))
 
-        def share(one: np.ndarray, size=size) -> np.ndarray:
-            return np.linalg.norm(_spread(one), axis=-1) / size
+        def share(deviation: np.ndarray, size=size) -> np.ndarray:
+            return np.linalg.norm(_spread(deviation), axis=-1) / size
 
         foretold = _foretold((P, R, felt), loop, free, off[0])
         error = share(foretold - off[:, None])
@@ -227,15 +227,15 @@ def closed_loop(case: Case, loop: Loop, own: dict, patterns: int) -> list[dict]:
             "left": share(off),
             "foretold": share(foretold[:, 0]),
         }
-        found.append(
+        rows.append(
             {"kind": "kick", **asdict(case), **asdict(loop), "pattern": seed}
             | {"kick_rms_rad": size / case.n**0.5, "error_low": low, "error_high": high}
-            | {name: one[-1] for name, one in over_time.items()}
-            | {f"{name}_most": one.max() for name, one in over_time.items()}
-            | {f"{name}_t": one.tolist() for name, one in over_time.items()}
+            | {name: course[-1] for name, course in over_time.items()}
+            | {f"{name}_most": course.max() for name, course in over_time.items()}
+            | {f"{name}_t": course.tolist() for name, course in over_time.items()}
             | {"t_s": (np.arange(len(off)) * STEP_S).tolist()}
         )
-    return found
+    return rows
 
 
 def _foretold(drawn: tuple, loop: Loop, free: np.ndarray, kick: np.ndarray) -> np.ndarray:
@@ -255,43 +255,43 @@ def _foretold(drawn: tuple, loop: Loop, free: np.ndarray, kick: np.ndarray) -> n
 
     def rate(off: np.ndarray, tick: int) -> np.ndarray:
         theta = 2 * free[tick] + lag
-        turned, grown = ((one @ off[..., None])[..., 0] for one in (P, R))
-        own = (np.cos(lag) + np.cos(theta)) * turned + (np.sin(lag) + np.sin(theta)) * grown
-        return loop.eps * (gain * (own - (np.cos(lag) - np.cos(theta)) * off) - off @ links)
+        turned, grown = ((matrix @ off[..., None])[..., 0] for matrix in (P, R))
+        driven = (np.cos(lag) + np.cos(theta)) * turned + (np.sin(lag) + np.sin(theta)) * grown
+        return loop.eps * (gain * (driven - (np.cos(lag) - np.cos(theta)) * off) - off @ links)
 
     off = np.repeat(kick[None], len(P), axis=0)
-    found, h = [off], STEP_S
+    trajectory, h = [off], STEP_S
     for tick in range(0, len(free) - TICKS, TICKS):
         k1 = rate(off, tick)
         k2 = rate(off + h / 2 * k1, tick + TICKS // 2)
         k3 = rate(off + h / 2 * k2, tick + TICKS // 2)
         k4 = rate(off + h * k3, tick + TICKS)
         off = off + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        found.append(off)
-    return np.array(found)
+        trajectory.append(off)
+    return np.array(trajectory)
 
 
 def _averaged(J: np.ndarray, off: np.ndarray) -> np.ndarray:
     """Return exp(J t) off(0) at the times of the observed phases."""
     step = expm(J * STEP_S)
-    found = [off[0]]
+    trajectory = [off[0]]
     for _ in off[1:]:
-        found.append(step @ found[-1])
-    return np.array(found)
+        trajectory.append(step @ trajectory[-1])
+    return np.array(trajectory)
 
 
 def _spread(off: np.ndarray) -> np.ndarray:
     return off - off.mean(axis=-1, keepdims=True)
 
 
-def _phases(case: Case, loop: Loop, own: dict, seed: int) -> np.ndarray:
+def _phases(case: Case, loop: Loop, identified: dict, seed: int) -> np.ndarray:
     """Return phases at each tick from the kick on; no kick if the seed is 0."""
     at_s = max(KICK_AT_S, loop.until_s + 2 * STEP_S)
     chain = {
         "forward": loop.eps * loop.K,
         "backward": loop.eps * loop.K,
         "feedback": loop.eps,
-        "feedback_bias": _felt(own).imag.tolist(),
+        "feedback_bias": _felt(identified).imag.tolist(),
     }
     if seed:
         chain |= {"kick_every_s": at_s, "kick_size": loop.kick, "kick_seed": seed}

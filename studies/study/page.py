@@ -81,7 +81,7 @@ def write_page(rows: Path, page: Path, *, quick: bool) -> Results:
     results = results_of(rows)
     draw_all(results, page.parent / "images")
     verdicts = evaluate(results)
-    by_name = {one.conclusion.name: one for one in verdicts}
+    by_name = {verdict.conclusion.name: verdict for verdict in verdicts}
     parts = _numbers(results) | {
         "planned": f"{sum(_planned(quick=quick).values())}",
         "answer": [_sentence(by_name[name]) for name in ANSWER if by_name[name].holds],
@@ -98,7 +98,9 @@ def write_page(rows: Path, page: Path, *, quick: bool) -> Results:
         "growth": _growth(results),
         "explicit": markdown(results.measures, EXPLICIT),
     }
-    text = {name: one if isinstance(one, str) else "\n".join(one) for name, one in parts.items()}
+    text = {
+        name: part if isinstance(part, str) else "\n".join(part) for name, part in parts.items()
+    }
     page.write_text(Template((HERE / "page.txt").read_text()).substitute(text))
     return results
 
@@ -160,9 +162,10 @@ def _cell(value: object) -> str:
 
 def _planned(*, quick: bool) -> dict[str, int]:
     """Return how many runs each sweep has."""
-    plans = {one.name: one.plan for one in stages(quick=quick)}  # the last of a name has all points
+    # The last of a name has all points.
+    plans = {stage.name: stage.plan for stage in stages(quick=quick)}
     return {
-        name: plan.points or math.prod(len(one.values) for one in plan.parameters)
+        name: plan.points or math.prod(len(parameter.values) for parameter in plan.parameters)
         for name, plan in plans.items()
     }
 
@@ -183,20 +186,22 @@ def _design(results: Results, *, quick: bool) -> list[str]:
     return table(names, cells)
 
 
-def _sentence(one: Verdict) -> str:
-    return one.conclusion.sentence.format(value=interval(one.value, one.low, one.high))
+def _sentence(verdict: Verdict) -> str:
+    return verdict.conclusion.sentence.format(
+        value=interval(verdict.value, verdict.low, verdict.high)
+    )
 
 
 def _conclusions(verdicts: list[Verdict]) -> list[str]:
     holds = {True: "yes", False: "**no**", None: "open"}
     cells = [
         [
-            f"`{one.conclusion.name}`",
-            _sentence(one),
-            one.expression,
-            holds[one.holds],
+            f"`{verdict.conclusion.name}`",
+            _sentence(verdict),
+            verdict.expression,
+            holds[verdict.holds],
         ]
-        for one in verdicts
+        for verdict in verdicts
     ]
     return table(["name", "", "inequality", "holds"], cells)
 
@@ -254,44 +259,44 @@ def _prediction() -> list[str]:
     """Return the tables of ``prediction.py``, from ``rows/prediction`` where it was computed."""
     folder = HERE / "rows" / "prediction"
     if not folder.is_dir():
-        known = "[Oscillators](explanation/oscillators.md#measured-in-the-twin)"
-        return [f"{known} has what has been predicted so far: 5 to 13 yaw joints."]
+        link = "[Oscillators](explanation/oscillators.md#measured-in-the-twin)"
+        return [f"{link} has what has been predicted so far: 5 to 13 yaw joints."]
     from .prediction import PATTERNS, STANDARD, rows, summary
 
     kicks = rows(folder).query("kind == 'kick'")
     count = kicks.groupby(list(LOOP), sort=True).size().rename("patterns").reset_index()
-    found = summary(kicks).merge(count, on=list(LOOP))
+    lines = summary(kicks).merge(count, on=list(LOOP))
     shares = [
         *(name for name in SHARES if name not in ("error/still", "below")),
         "left",
         "foretold",
     ]
-    found[shares] = found[shares].mul(100.0).map(lambda x: "–" if np.isnan(x) else f"{x:.1f}")
-    coupled = found.K > 0
-    usual = (found.patterns == PATTERNS) & (found.kick == STANDARD.kick) & ~coupled
-    shown = coupled | (found.until_s > STANDARD.until_s)
+    lines[shares] = lines[shares].mul(100.0).map(lambda x: "–" if np.isnan(x) else f"{x:.1f}")
+    coupled = lines.K > 0
+    usual = (lines.patterns == PATTERNS) & (lines.kick == STANDARD.kick) & ~coupled
+    shown = coupled | (lines.until_s > STANDARD.until_s)
     left = LOOP | {"left": "left %", "foretold": "foretold %", "patterns": "patterns"}
     return [
-        *markdown(found[usual], {n: LOOP[n] for n in ("n", "engine", "law")} | SHARES),
+        *markdown(lines[usual], {n: LOOP[n] for n in ("n", "engine", "law")} | SHARES),
         "",
         "Explicit coupling K of next neighbours: none, half of what is foretold as needed, all.",
         "",
         *markdown(
-            found[shown],
+            lines[shown],
             {n: left[n] for n in ("n", "K", "until_s")} | dict(list(left.items())[-3:]),
         ),
         "",
         "Where it breaks: weaker servos, larger kicks, faster feedback.",
         "",
-        *markdown(found[~usual & ~shown], LOOP | SHARES),
+        *markdown(lines[~usual & ~shown], LOOP | SHARES),
     ]
 
 
 def _growth(results: Results) -> list[str]:
     cells = []
     for _, row in results.growth.iterrows():
-        found = interval(row["value"], row["low"], row["high"])
-        time = "never" if np.isnan(row["value"]) else found
+        exponent = interval(row["value"], row["low"], row["high"])
+        time = "never" if np.isnan(row["value"]) else exponent
         rate, detuned = (f"{row[k]:.2f}".replace("-", "−") for k in ("gap", "detuned"))
         shown = rate if row["settles"] else "–"
         against = interval(*(row[f"against_{end}"] for end in ("value", "low", "high")))

@@ -45,10 +45,10 @@ def rows(folder: Path) -> pd.DataFrame:
     return pd.concat([pd.read_parquet(file) for file in files], ignore_index=True)
 
 
-def summary(found: pd.DataFrame) -> pd.DataFrame:
+def summary(table: pd.DataFrame) -> pd.DataFrame:
     """Return one line for each chain and loop: the means over patterns, and the worst."""
     keys = [*Case.__annotations__, *Loop.__annotations__]
-    kicks = found[found.kind == "kick"]
+    kicks = table[table.kind == "kick"]
 
     def line(group: pd.DataFrame) -> pd.Series:
         half = 2.262 * group.error.std() / len(group) ** 0.5 if len(group) == 10 else math.nan
@@ -81,10 +81,10 @@ def body(out: Path, case: Case) -> dict:
 
 def kicks(out: Path, case: Case, loop: Loop = STANDARD, patterns: int = PATTERNS) -> list[dict]:
     """Return the rows of the kicks of a closed loop; computed where there are none yet."""
-    own = body(out, case)
+    identified = body(out, case)
     return _kept(
         out / f"kick-{_key(case)}-{_key(loop)}-{patterns}.parquet",
-        lambda: closed_loop(case, loop, own, patterns),
+        lambda: closed_loop(case, loop, identified, patterns),
     )
 
 
@@ -120,9 +120,9 @@ def _key(part: Case | Loop) -> str:
 
 def _kept(path: Path, compute) -> list[dict]:
     if not path.exists():
-        found = pd.DataFrame(compute())
+        frame = pd.DataFrame(compute())
         part = path.with_suffix(".part")
-        found.to_parquet(part)
+        frame.to_parquet(part)
         part.rename(path)
         print(f"{time.strftime('%H:%M:%S')} {path.name}", flush=True)
     return pd.read_parquet(path).to_dict("records")

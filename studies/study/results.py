@@ -40,11 +40,11 @@ class Results:
 
     def slice(self, name: str) -> pd.DataFrame:
         """Return a slice's rows that are done, in the order of its values."""
-        found = self.rows[(self.rows["plan"] == f"slice-{name}") & (self.rows["status"] == "done")]
+        rows = self.rows[(self.rows["plan"] == f"slice-{name}") & (self.rows["status"] == "done")]
         column = SLICES[name][0]
-        if column not in found:  # not run yet
-            return found.assign(**{column: None})
-        return found.sort_values(column, ignore_index=True)
+        if column not in rows:  # not run yet
+            return rows.assign(**{column: None})
+        return rows.sort_values(column, ignore_index=True)
 
 
 SLICES = {

@@ -35,18 +35,18 @@ def scatter(path: Path, folder: Path, source: str) -> None:
 
 def gather(folder: Path, path: Path) -> None:
     """Write the finished rows of all sweeps under a folder into one Parquet file."""
-    stores = sorted(one.parent for one in folder.glob("*/rows"))
+    stores = sorted(rows_folder.parent for rows_folder in folder.glob("*/rows"))
     sources = {
-        one.stem: json.loads(one.read_text())["software"]["source"]
-        for one in folder.glob("*/settings/*.json")
+        file.stem: json.loads(file.read_text())["software"]["source"]
+        for file in folder.glob("*/settings/*.json")
     }
-    found = [
+    rows = [
         {"plan": store.name, "source": row.get("source") or sources[row["setting"]], **_kept(row)}
         for store in stores
         for row in RowStore(str(store)).rows()
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
-    frame = pd.DataFrame(found).sort_values(["plan", "changes", "key"], ignore_index=True)
+    frame = pd.DataFrame(rows).sort_values(["plan", "changes", "key"], ignore_index=True)
     frame.to_parquet(path, compression="zstd", index=False)
 
 
@@ -72,7 +72,7 @@ def read_rows(path: Path) -> pd.DataFrame:
     frame = pd.read_parquet(path)
     changes = pd.DataFrame([json.loads(text) for text in frame["changes"]])
     frame = pd.concat([frame, changes.rename(columns=_short)], axis=1)
-    frame["n"] = [np.nan if one is None else float(len(one)) for one in frame["gain"]]
+    frame["n"] = [np.nan if gains is None else float(len(gains)) for gains in frame["gain"]]
     return frame
 
 

@@ -34,11 +34,13 @@ STATEMENTS = tuple(
 
 def lines(verdicts: list[Verdict]) -> list[str]:
     """Return the table of statements; a statement whose conclusions fail is open."""
-    by_name = {one.conclusion.name: one for one in verdicts}
+    by_name = {verdict.conclusion.name: verdict for verdict in verdicts}
     rows = ["| the paper | verdict | with |", "|---|---|---|"]
-    for one in STATEMENTS:
-        named = [by_name[name] for name in one.conclusions]
-        verdict = one.verdict if all(v.holds for v in named) else "open"
-        with_ = " ".join([*(f"`{v.conclusion.name}`: {v.expression}." for v in named), one.finding])
-        rows.append(f"| {one.text} | **{verdict}** | {with_} |")
+    for statement in STATEMENTS:
+        named = [by_name[name] for name in statement.conclusions]
+        verdict = statement.verdict if all(v.holds for v in named) else "open"
+        with_ = " ".join(
+            [*(f"`{v.conclusion.name}`: {v.expression}." for v in named), statement.finding]
+        )
+        rows.append(f"| {statement.text} | **{verdict}** | {with_} |")
     return rows
