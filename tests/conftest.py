@@ -42,7 +42,7 @@ def _children(since_s):
     itself.
     """
     first = int(since_s * os.sysconf("SC_CLK_TCK"))
-    found = set()
+    children = set()
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             with contextlib.suppress(OSError):
@@ -50,19 +50,19 @@ def _children(since_s):
                 state, parent, began = facts[0], int(facts[1]), int(facts[19])
                 is_tracker = b"tracker" in (folder / "cmdline").read_bytes()
                 if parent == os.getpid() and state != "Z" and began >= first and not is_tracker:
-                    found.add(int(folder.name))
-    return found
+                    children.add(int(folder.name))
+    return children
 
 
 def _end_children(since_s=0.0):
     """Kill running children; those of a killed one become children of this process."""
     for _ in range(10):
-        found = _children(since_s)
-        for pid in found:
+        children = _children(since_s)
+        for pid in children:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
                 os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)  # left to its Popen object
-        if not found:
+        if not children:
             return
 
 

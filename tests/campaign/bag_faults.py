@@ -195,14 +195,14 @@ def _odd_messages(data, rng):
     value = rng.choice([*_DATA[:5], zstd_bomb(rng)])
     writer = Writer(out)
     writer.start("ros2", "")
-    known = {}
-    for number, (schema, way, one) in enumerate(make_reader(io.BytesIO(data)).iter_messages()):
-        if way.topic not in known:
+    channels = {}
+    for number, (schema, way, message) in enumerate(make_reader(io.BytesIO(data)).iter_messages()):
+        if way.topic not in channels:
             kind = writer.register_schema(schema.name, schema.encoding, schema.data)
             facts = dict(way.metadata) | {"offered_qos_profiles": rng.choice(["", *_QOS])}
-            known[way.topic] = writer.register_channel(way.topic, "cdr", kind, facts)
-        content = value if number % every == 0 else one.data
-        writer.add_message(known[way.topic], one.log_time, content, one.publish_time)
+            channels[way.topic] = writer.register_channel(way.topic, "cdr", kind, facts)
+        content = value if number % every == 0 else message.data
+        writer.add_message(channels[way.topic], message.log_time, content, message.publish_time)
     writer.finish()
     return out.getvalue()
 
@@ -222,7 +222,7 @@ _HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 3, 4, 5, 6, 7
 
 def _records(data):
     """Return the records of a bag: fields of the header, and content."""
-    at, found = len(_MAGIC), []
+    at, records = len(_MAGIC), []
     while at + 4 <= len(data):
         (size,) = struct.unpack_from("<I", data, at)
         head, fields, inner = data[at + 4 : at + 4 + size], {}, 0
@@ -232,9 +232,9 @@ def _records(data):
             fields[name], inner = value, inner + 4 + length
         at += 4 + size
         (size,) = struct.unpack_from("<I", data, at)
-        found.append([fields, data[at + 4 : at + 4 + size], at])
+        records.append([fields, data[at + 4 : at + 4 + size], at])
         at += 4 + size
-    return found
+    return records
 
 
 def _packed(fields):
@@ -281,15 +281,15 @@ def bz2_zeros(mib):
 def _bomb_chunk(data, rng):
     """A chunk expands far beyond what it declares, or honestly to hundreds of MiB."""
     records = _records(data)
-    fields, inside, _ = one = rng.choice(_of(records, _CHUNK))
+    fields, inside, _ = chunk = rng.choice(_of(records, _CHUNK))
     mib = rng.choice([10, 300, 3000])
     kind = rng.choice(["bz2", "lz4"])
-    one[1] = bz2_zeros(mib) if kind == "bz2" else lz4_zeros(mib * MIB)
+    chunk[1] = bz2_zeros(mib) if kind == "bz2" else lz4_zeros(mib * MIB)
     plain = {b"none": bytes, b"bz2": bz2.decompress, b"lz4": lz4.frame.decompress}
     if rng.random() < 0.5:  # its own messages, then zeros
-        own = plain[fields[b"compression"]](inside)
+        payload = plain[fields[b"compression"]](inside)
         pack = bz2.compress if kind == "bz2" else lz4.frame.compress
-        one[1] = pack(own + bytes(min(mib, 300) * MIB))
+        chunk[1] = pack(payload + bytes(min(mib, 300) * MIB))
     declared = rng.choice([len(inside), mib * MIB, 0, 2**32 - 1])
     fields[b"compression"], fields[b"size"] = kind.encode(), struct.pack("<I", declared)
     return _rebuilt(records)
@@ -299,7 +299,7 @@ def _lying_record(data, rng):
     """A field or a length of any record is another number."""
     records = _records(data)
     for _ in range(rng.choice([1, 1, 3])):
-        fields, content, _ = one = rng.choice(records)
+        fields, content, _ = record = rng.choice(records)
         numbers = [name for name, value in fields.items() if len(value) in {4, 8}]
         kind = rng.random()
         if kind < 0.4 and numbers:
@@ -312,7 +312,7 @@ def _lying_record(data, rng):
         elif kind < 0.7:
             del fields[rng.choice(list(fields))]
         elif len(content) >= 16:
-            one[1] = mutate_bytes(content, rng)
+            record[1] = mutate_bytes(content, rng)
     return _rebuilt(records)
 
 
@@ -327,30 +327,30 @@ def _repeated(data, rng):
         total = struct.pack("<I", len(infos) + count)
         records[0][0][b"chunk_count"] = total
     else:
-        fields, content, _ = one = rng.choice(_of(records, _INDEX))
-        one[1] = content[:12] * (count * 10) + content
-        fields[b"count"] = struct.pack("<I", len(one[1]) // 12)
+        fields, content, _ = index = rng.choice(_of(records, _INDEX))
+        index[1] = content[:12] * (count * 10) + content
+        fields[b"count"] = struct.pack("<I", len(index[1]) // 12)
     return _rebuilt(records)
 
 
 def _odd_connection(data, rng):
     """A connection has another type, another definition, or another number."""
     records = _records(data)
-    found = _of(records, _CONNECTION)
-    one, other = rng.choice(found), rng.choice(found)
+    connections = _of(records, _CONNECTION)
+    connection, other = rng.choice(connections), rng.choice(connections)
     kind = rng.randrange(3)
     if kind == 0:
-        one[1] = other[1]
+        connection[1] = other[1]
     elif kind == 1:
-        one[0][b"conn"] = other[0][b"conn"]
+        connection[0][b"conn"] = other[0][b"conn"]
     else:
-        inside = mutate_text(one[1], rng)
+        inside = mutate_text(connection[1], rng)
         name = b"message_definition="
         texts = [b"", b"float64[] a\n" * 20_000, b"A a\n" + b"=" * 80 + b"\nMSG: x/A\nx/A a\n"]
         texts += [b"uint8[4000000000] a\n", b"float64[10000000] a\n", b"\x1b[2J a\n"]
         definition = name + rng.choice(texts)
         inside += struct.pack("<I", len(definition)) + definition
-        one[1] = inside
+        connection[1] = inside
     return _rebuilt(records)
 
 
@@ -370,11 +370,11 @@ def mutate_folder(files, rng):
     """Remove a file of a bag, name it otherwise, or put something else in its place."""
     names = [name for name in files if not name.endswith(".yaml")]
     name, kind = rng.choice(names), rng.randrange(6)
-    folder, _, own = name.rpartition("/")
+    folder, _, base_name = name.rpartition("/")
     if kind == 0:
         del files[name]
     elif kind == 1:
-        files[f"{folder}/copy-of-{own}"] = files[name]
+        files[f"{folder}/copy-of-{base_name}"] = files[name]
     elif kind == 2:
         files[name] = rng.choice([b"", b"\0" * 100, files[rng.choice(list(files))]])
     elif kind == 3:

@@ -227,8 +227,8 @@ def write_texts(folder):
 
 def files_below(folder):
     """Return the files of a folder: relative path to content."""
-    found = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def make_bases(folder, result_of):

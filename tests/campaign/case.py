@@ -240,23 +240,23 @@ def control_characters(data):
 
 def judge(outcome):
     """Return the failures of a command's run; each begins with its kind."""
-    found = []
+    failures = []
     if outcome.hung:
-        found.append(f"hang: no end within {WALL_S:.0f} s")
+        failures.append(f"hang: no end within {WALL_S:.0f} s")
     elif outcome.signal == signal.SIGXCPU or outcome.cpu_s > CPU_S:
-        found.append(f"time: over {CPU_S} s of processor time")
+        failures.append(f"time: over {CPU_S} s of processor time")
     elif outcome.signal is not None and not outcome.killed:
-        found.append(f"signal: ended by {signal.Signals(outcome.signal).name}")
+        failures.append(f"signal: ended by {signal.Signals(outcome.signal).name}")
     if outcome.peak > PEAK_BYTES:
-        found.append(f"memory: {outcome.peak / MIB:.0f} MiB")
+        failures.append(f"memory: {outcome.peak / MIB:.0f} MiB")
     bad = (b"Traceback (most recent call last)", b"Exception ignored", b"Fatal Python error")
     if outcome.code == STRAY or any(word in outcome.err for word in bad):
-        found.append(f"traceback: {last_line(outcome.err)}")
+        failures.append(f"traceback: {last_line(outcome.err)}")
     elif outcome.code is not None and outcome.code not in (0, 1, 2):
-        found.append(f"exit code: {outcome.code}")
+        failures.append(f"exit code: {outcome.code}")
     elif outcome.code and not outcome.out.strip() and not outcome.err.strip():
-        found.append(f"silent: exit code {outcome.code} without a word")
+        failures.append(f"silent: exit code {outcome.code} without a word")
     for name, data in (("stdout", outcome.out), ("stderr", outcome.err)):
         if characters := control_characters(data):
-            found.append(f"escape: raw {', '.join(map(ascii, characters[:8]))} on {name}")
-    return found
+            failures.append(f"escape: raw {', '.join(map(ascii, characters[:8]))} on {name}")
+    return failures

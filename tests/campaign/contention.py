@@ -31,14 +31,14 @@ def run(seed, stage):
             recorder(folder, ("a", "b")) as running,
             senders(folder, ("a", "b"), **load) as sending,
         ):
-            reports = [one.result() for one in sending]
+            reports = [sender.result() for sender in sending]
             time.sleep(1.0)
             code = end(running)
         errors = (folder / "recorder.err").read_text(errors="replace")
         if code != 0 or "Traceback" in errors:
             result.failures.append(f"recorder: exit code {code}: {errors[-300:]}")
-        for one, report in zip(sending, reports, strict=True):
-            result.failures += check_kept(folder, one, report["accepted"])
+        for sender, report in zip(sending, reports, strict=True):
+            result.failures += check_kept(folder, sender, report["accepted"])
         accepted, refused = (
             sum(report[key] for report in reports) for key in ("accepted", "refused")
         )

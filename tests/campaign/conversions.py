@@ -100,20 +100,20 @@ def contents(place):
 
 def faults(outcome, place, before, wall_s):
     """Return what is wrong with the end of a conversion."""
-    found = []
+    failures = []
     if wall_s > LONGEST_S and not outcome.hung:
-        found.append(f"hang: {wall_s:.0f} s")
+        failures.append(f"hang: {wall_s:.0f} s")
     if outcome.code == 0:
         if reason := whole(place / "new.rrd"):
-            found.append(f"output: new.rrd is not whole: {reason}")
+            failures.append(f"output: new.rrd is not whole: {reason}")
         if set(contents(place)) != {"new.rrd"}:
-            found.append(f"output: left {sorted(contents(place))}")
-        return found
+            failures.append(f"output: left {sorted(contents(place))}")
+        return failures
     text = outcome.err.decode(errors="replace")
     if outcome.code != 1:
-        found.append(f"exit code: {outcome.code} on a full disk")
+        failures.append(f"exit code: {outcome.code} on a full disk")
     if not text.startswith("error: ") or text.count("\n") != 1:
-        found.append(f"message: {text[:200]!r}")
+        failures.append(f"message: {text[:200]!r}")
     if contents(place) != before:
-        found.append(f"output: left {sorted(contents(place))} of {sorted(before)}")
-    return found
+        failures.append(f"output: left {sorted(contents(place))} of {sorted(before)}")
+    return failures

@@ -61,7 +61,7 @@ def _tracks(folder):
 
 def _tables(folder):
     states, sets = folder / "states", (folder / "dataset", folder / "dataset21")
-    for path in (states, *(one / "meta" for one in sets)):
+    for path in (states, *(dataset / "meta" for dataset in sets)):
         path.mkdir(parents=True)
     head = "time,joint1_pos,joint2_vel,joint3_cmd"
     np.savetxt(folder / "wide.csv", np.column_stack([T, Q]), "%.9g", ",", header=head, comments="")
@@ -95,13 +95,13 @@ def _tables(folder):
     bases.append(Base("apart", "states/state.csv", files, ("commands.csv", "states/state.csv")))
     names = ("run.npz", "run.mat", "plain.mat", "run.parquet", "run.pt")
     bases += [Base("arrays", name, files, (name,)) for name in names]
-    sets = ((one.name, below(one.name)) for one in sets)
+    sets = ((dataset.name, below(dataset.name)) for dataset in sets)
     return [*bases, *(Base("dataset", name, files, inside) for name, inside in sets)]
 
 
 def tensor(key, size, shape, strides, offset=0):
     """Return the opcodes that name one tensor of a storage; strides count numbers."""
-    dims, steps = ("".join(f"I{n}\n" for n in each) for each in (shape, strides))
+    dims, steps = ("".join(f"I{n}\n" for n in numbers) for numbers in (shape, strides))
     return (
         f"ctorch._utils\n_rebuild_tensor_v2\n((Vstorage\nctorch\nDoubleStorage\n"
         f"V{key}\nVcpu\nI{size}\ntQI{offset}\n({dims}t({steps}tI00\n}}tR"

@@ -164,34 +164,36 @@ def session_parts(session):
 
 def check_output(folder):
     """Return faults of the outputs under their final names, by mcap's own reader."""
-    found = []
+    damage = []
     names = ("new*.mcap", "new/*.mcap", "frames.mcap")
     for path in itertools.chain.from_iterable(map(folder.glob, names)):
         try:
             messages_of(path)
         except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
-            found.append(f"output: {path.name} is no whole file: {type(error).__name__}: {error}")
+            damage.append(f"output: {path.name} is no whole file: {type(error).__name__}: {error}")
     for path in folder.glob("new*.json"):
         try:
             json.loads(path.read_bytes())
         except ValueError as error:
-            found.append(f"output: {path.name}: {error}")
-    return found
+            damage.append(f"output: {path.name}: {error}")
+    return damage
 
 
 def check_strays(case, folder):
     """Return inputs that a command changed, and files that one that reads put elsewhere."""
-    found = [name for name, data in case.files.items() if (folder / name).read_bytes() != data]
-    found = [f"input: {name} was changed" for name in found]
+    strays = [name for name, data in case.files.items() if (folder / name).read_bytes() != data]
+    strays = [f"input: {name} was changed" for name in strays]
     if case.words[0] not in READING:
-        return found
+        return strays
     beside = {f"{folder.name}.out", f"{folder.name}.err", "modules"}
     for name in files_below(folder.parent):
-        own = name.removeprefix(f"{folder.name}/")
-        expected = own in case.files or own.startswith(OUTPUTS) if own != name else name in beside
+        inner = name.removeprefix(f"{folder.name}/")
+        expected = (
+            inner in case.files or inner.startswith(OUTPUTS) if inner != name else name in beside
+        )
         if not expected and not name.startswith("scratch"):
-            found.append(f"stray: {name} was left")
-    return found
+            strays.append(f"stray: {name} was left")
+    return strays
 
 
 def run_case(case, folder, modules=None):
@@ -229,7 +231,7 @@ def minimise(case, kind, bases, fresh, seconds=40.0):
     def fails(files):
         tried = Case(case.words, files, case.ended_after_s)
         with fresh() as folder:
-            return any(kind_of(one) == kind for one in run_case(tried, folder)[0])
+            return any(kind_of(failure) == kind for failure in run_case(tried, folder)[0])
 
     files = dict(case.files)
     for name in list(files):
@@ -243,7 +245,7 @@ def minimise(case, kind, bases, fresh, seconds=40.0):
             if path == name and data != files[name] and fails(files | {name: data}):
                 files[name] = data
                 break
-    for name in sorted(files, key=lambda one: -len(files[one])):
+    for name in sorted(files, key=lambda name: -len(files[name])):
         step = len(files[name]) // 2
         while step >= 1 and time.monotonic() < deadline:
             at = 0
@@ -264,19 +266,19 @@ def warm(cases, fresh):
     Returns:
         Failures of the cases.
     """
-    wanted = {}
-    found = []
+    modules = {}
+    faults = []
     for case in cases:
         with fresh() as folder:
             listing = folder.parent / "modules"
             failures, outcome = run_case(case, folder, listing)
             if listing.exists():
-                wanted |= dict.fromkeys(listing.read_text().split("\n"))
+                modules |= dict.fromkeys(listing.read_text().split("\n"))
         if outcome.code:
             failures.append(f"exit code {outcome.code}: {outcome.errors}")
-        found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
-    for name in wanted:
+        faults += [f"{' '.join(case.words)}: {fault}" for fault in failures]
+    for name in modules:
         if name not in sys.modules and not name.startswith("__"):
             with contextlib.suppress(Exception):  # parts of a package that only it can import
                 import_module(name)
-    return found
+    return faults

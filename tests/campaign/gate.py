@@ -120,7 +120,7 @@ class FarEnd:
             while self._inbox:
                 word = self._inbox.popleft().strip(b"< ").split()
                 if word[0] == b"send":
-                    self._frame(int(word[1], 16), bytes(int(one, 16) for one in word[3:]))
+                    self._frame(int(word[1], 16), bytes(int(byte, 16) for byte in word[3:]))
                     continue
                 if word[0] == b"rawmode":  # python-can takes its answer and a frame for one text
                     opened, next_state = True, time.monotonic() + 0.2
@@ -171,14 +171,14 @@ class FarEnd:
             limit: Of all angles [rad].
             measured_s: The reply interval that the drive measured [s].
         """
-        found, worst = [], 0.0
+        failures, worst = [], 0.0
         if not self.polled and measured_s > self.interval_s + SPREAD_S:
-            found.append(f"reply interval: {measured_s:.3f} s, {self.interval_s:.3f} s sent")
+            failures.append(f"reply interval: {measured_s:.3f} s, {self.interval_s:.3f} s sent")
         ticks = max(3, math.ceil(3 * max(self.interval_s, measured_s) / PERIOD_S - 1e-9))
         allowed = 1 if self.polled else ticks + 1
         for joint, rows in self.commands.items():
             if (most := max(abs(angle) for _, _, angle in rows)) > limit + ROUNDING:
-                found.append(
+                failures.append(
                     f"position: joint {joint} commanded to {most:.4f} rad, limit {limit:.4f}"
                 )
             first_s = rows[0][0] - PERIOD_S
@@ -189,8 +189,10 @@ class FarEnd:
                 low = min(low, angle - MAX_RATE * after_s)
                 high = max(high, angle + MAX_RATE * after_s)
         if worst > allowed * STEP + 2 * ROUNDING:
-            found.append(f"step: {worst:.4f} rad beyond the rate, {allowed} x {STEP:.2f} allowed")
-        return found, worst / STEP
+            failures.append(
+                f"step: {worst:.4f} rad beyond the rate, {allowed} x {STEP:.2f} allowed"
+            )
+        return failures, worst / STEP
 
 
 def run(seed, stage):

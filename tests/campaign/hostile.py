@@ -27,8 +27,8 @@ END = record(15, struct.pack("<I", 0)) + record(2, struct.pack("<QQI", 0, 0, 0))
 
 
 def schema(number=1, name=JOINT_STATE, data=None):
-    own = schema_text(name) if data is None else data
-    return record(3, struct.pack("<H", number) + text(name) + text("ros2msg") + text(own))
+    definition = schema_text(name) if data is None else data
+    return record(3, struct.pack("<H", number) + text(name) + text("ros2msg") + text(definition))
 
 
 def channel(number, topic, of=1):

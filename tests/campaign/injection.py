@@ -74,10 +74,10 @@ def _evil_session(path, rng):
 def _spoil(text, rng):
     """Return a TOML or DBC text in which some strings are evil."""
 
-    def worse(found):
+    def worse(match):
         if rng.random() > 0.15:
-            return found.group()
-        evil_text = found.group(1) + rng.choice(EVIL)
+            return match.group()
+        evil_text = match.group(1) + rng.choice(EVIL)
         if rng.random() < 0.5:  # raw control characters are no TOML: escaped ones are
             evil_text = "".join(
                 f"\\u{ord(c):04x}" if ord(c) < 0xA0 and not c.isalnum() else c for c in evil_text
@@ -150,7 +150,7 @@ def _lay_out(kind, folder, rng, stage):
 
 def _check_pages(folder):
     """Return markup from names in pages, and cells of tables that a spreadsheet computes."""
-    found = [
+    markup = [
         f"page: {hit.group()!r} in {path.name}"
         for path in folder.glob("new*.html")
         if (hit := HTML.search(path.read_bytes()))
@@ -162,8 +162,8 @@ def _check_pages(folder):
                     if cell[:1] in set("=@\t\r") or (
                         cell[:1] in set("+-") and not _is_number(cell)
                     ):
-                        return [*found, f"formula: {cell[:40]!r} in {path.name}"]
-    return found
+                        return [*markup, f"formula: {cell[:40]!r} in {path.name}"]
+    return markup
 
 
 def _is_number(cell):

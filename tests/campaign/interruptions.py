@@ -100,8 +100,8 @@ def _stop_and_check(folder, stack, case, rng, result):
     paths = sorted(folder.glob("*.mcap"))
     for sender, accepted in zip(sending, reports, strict=True):
         result.failures += check_numbers(paths, kind, sender.bus, accepted["accepted"])
-    if (found := stop_events(paths)) < apart:
-        result.failures.append(f"event: {found} events of {stops} stops")
+    if (counted := stop_events(paths)) < apart:
+        result.failures.append(f"event: {counted} events of {stops} stops")
     result.figures = {"n_accepted": sum(r["accepted"] for r in reports), "n_stops": stops}
 
 

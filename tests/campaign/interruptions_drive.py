@@ -76,8 +76,8 @@ class Listener(threading.Thread):
                 whole = text.rfind(b">") + 1
                 rest = text[whole:]
                 self.rows += [
-                    (now, int(found[1], 16), bytes.fromhex(found[2].decode()))
-                    for found in FRAME.finditer(text[:whole])
+                    (now, int(match[1], 16), bytes.fromhex(match[2].decode()))
+                    for match in FRAME.finditer(text[:whole])
                 ]
 
     def close(self):
@@ -89,12 +89,12 @@ class Listener(threading.Thread):
 
     def angles(self, first):
         """Return the angles of each joint from one frame a joint on: times [s], angles [rad]."""
-        found = {joint: [] for joint in range(JOINTS)}
+        angles_of = {joint: [] for joint in range(JOINTS)}
         for at_s, identifier, data in tuple(self.rows):
             if 0 <= identifier - first < JOINTS:
                 angle = math.radians(struct.unpack("<h", data[:2])[0] / 100)
-                found[identifier - first].append((at_s, angle))
-        return found
+                angles_of[identifier - first].append((at_s, angle))
+        return angles_of
 
     @property
     def commands(self):
@@ -312,18 +312,18 @@ def stop_live(rng, stage):
             wait_for(live.exists, "the view", alive=[view])
             how = {"rate": 2000, "per_packet": rng.choice([1, 9]), "seconds": length + 4.0}
             with senders(folder, ("a", "b"), **how) as sending:
-                for each in sending:
-                    each.wait_for(200)
+                for sender in sending:
+                    sender.wait_for(200)
                 time.sleep(rng.uniform(0.0, 1.0))
                 view.send_signal(signal.SIGSTOP)
                 time.sleep(length)
                 view.send_signal(signal.SIGCONT)
-                reports = [each.result() for each in sending]
+                reports = [sender.result() for sender in sending]
             if (code := end(running)) != 0:
                 result.failures.append(f"recorder: exit code {code}")
             view.wait(PATIENCE_S)
-        for each, counted in zip(sending, reports, strict=True):
-            result.failures += check_kept(folder, each, counted["accepted"])
+        for sender, counted in zip(sending, reports, strict=True):
+            result.failures += check_kept(folder, sender, counted["accepted"])
             result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + counted["accepted"]
         if view.returncode != 0:
             result.failures.append(f"view: exit code {view.returncode}")
@@ -364,7 +364,7 @@ while True:
 
 def registers(line, address):
     """Return a register of two bytes of each servo, by read requests of our own."""
-    found = {}
+    values = {}
     for servo in SERVOS:
         body = bytes([servo, 4, 2, address, 2])
         os.write(line, b"\xff\xff" + body + bytes([~sum(body) & 0xFF]))
@@ -373,8 +373,8 @@ def registers(line, address):
             if select.select([line], [], [], 0.1)[0]:
                 answer += os.read(line, 64)
         if len(answer) >= 8:
-            found[servo] = struct.unpack_from("<H", answer, 5)[0]
-    return found
+            values[servo] = struct.unpack_from("<H", answer, 5)[0]
+    return values
 
 
 def kill_serial(rng, stage):

@@ -110,23 +110,23 @@ def run_recorder(seed, stage):
             recorder(folder, ("a", "b"), options) as running,
             senders(folder, ("a", "b"), rate=rate, per_packet=per_packet, seconds=60) as sending,
         ):
-            for one in sending:
-                one.wait_for(200)
+            for sender in sending:
+                sender.wait_for(200)
             time.sleep(rng.uniform(0.0, 3.0))
             killed_ns = time.monotonic_ns()
             os.kill(running.pid, signal.SIGKILL)
             running.wait(30)
-            accepted = [one.accepted_before(killed_ns - 50_000_000) for one in sending]
+            accepted = [sender.accepted_before(killed_ns - 50_000_000) for sender in sending]
         (folder / "recovered").mkdir()
         words = ["log", "recover", folder / "run.mcap", "-o", folder / "recovered" / "r.mcap"]
         outcome = run_command(words, folder)
         result.add(outcome)
         if outcome.code:
             result.failures.append(f"recover: {outcome.errors}")
-        for one, least in zip(sending, accepted, strict=True):
-            result.failures += check_kept(folder / "recovered", one, least)
+        for sender, least in zip(sending, accepted, strict=True):
+            result.failures += check_kept(folder / "recovered", sender, least)
             result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + least
-            kept = len(numbers_in(sorted((folder / "recovered").glob("*.mcap")), one.bus))
-            tail_ms = one.lost_tail_ms(kept, killed_ns)
+            kept = len(numbers_in(sorted((folder / "recovered").glob("*.mcap")), sender.bus))
+            tail_ms = sender.lost_tail_ms(kept, killed_ns)
             result.figures["tail_ms"] = max(tail_ms, result.figures.get("tail_ms", 0))
     return result

@@ -41,15 +41,15 @@ LENGTH_AT, DATA_AT = 20, 24
 
 def bytes_of(path):
     """Return the bytes of the line in the order of the session, by mcap's own reader."""
-    found = bytearray()
+    line_bytes = bytearray()
     for *_, message in messages_of(path, topics=["/serial/line"], log_time_order=False):
         data, size = message.data, len(message.data)
         at = size - RECORD  # the array is the last field: a length before it, then whole records
         while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
             at -= RECORD
         for row in range(at, size, RECORD):
-            found += data[row + DATA_AT : row + DATA_AT + data[row + LENGTH_AT]]
-    return bytes(found)
+            line_bytes += data[row + DATA_AT : row + DATA_AT + data[row + LENGTH_AT]]
+    return bytes(line_bytes)
 
 
 def accepted(folder):

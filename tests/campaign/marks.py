@@ -26,7 +26,7 @@ def asked(folder, request):
 
 def torn(folder):
     """Return failures: files under a final name that mcap's own reader can't read to the end."""
-    found = []
+    failures = []
     for path in sorted(folder.glob("*.mcap")):
         try:
             with path.open("rb") as stream:
@@ -34,21 +34,21 @@ def torn(folder):
                 counted = sum(1 for _ in reader.iter_messages(log_time_order=False))
                 stated = reader.get_summary().statistics.message_count
         except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
-            found.append(f"torn: {path.name}: {type(error).__name__}: {error}")
+            failures.append(f"torn: {path.name}: {type(error).__name__}: {error}")
             continue
         if counted != stated:
-            found.append(f"torn: {path.name}: {counted} of {stated} messages")
-    return found
+            failures.append(f"torn: {path.name}: {counted} of {stated} messages")
+    return failures
 
 
 def unnamed(folder, names, places):
     """Return failures: part files that ``log info`` of some places doesn't name."""
-    found = []
+    failures = []
     for place in places:
         outcome = run_command(["log", "info", place], folder)
         text = (outcome.out + outcome.err).decode()
-        found += [f"unnamed: {name} by log info {place}" for name in names if name not in text]
-    return found
+        failures += [f"unnamed: {name} by log info {place}" for name in names if name not in text]
+    return failures
 
 
 def recovered(folder, name, result):

@@ -160,19 +160,19 @@ class _Remake:
 
     def add(self, number, schema, channel, message, *, hit):
         """Add one message; ``hit`` is whether it gets the faults of single messages."""
-        rng, own = self.rng, self.faults if hit else self.faults & {"time"}
+        rng, faults = self.rng, self.faults if hit else self.faults & {"time"}
         if schema.id not in self.schemas:
             self._add_schema(schema)
-        if channel.id not in self.channels or "channel" in own:
-            self._add_channel(channel, schema.id, astray="channel" in own)
-        if "few" in own:
+        if channel.id not in self.channels or "channel" in faults:
+            self._add_channel(channel, schema.id, astray="channel" in faults)
+        if "few" in faults:
             return
-        payload = _payload(message.data, rng) if "payload" in own else message.data
+        payload = _payload(message.data, rng) if "payload" in faults else message.data
         log_ns = message.log_time
-        if "time" in own:
+        if "time" in faults:
             log_ns = rng.choice([*HUGE, log_ns - self.jump]) if hit else log_ns
             log_ns += self.jump if number > 40 else 0
-        if "order" in own:
+        if "order" in faults:
             log_ns = max(0, log_ns - rng.choice([1, 10**8, 10**10]))
         times = log_ns % 2**64, message.publish_time % 2**64
         of = self.channels[channel.id]

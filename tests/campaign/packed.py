@@ -183,15 +183,15 @@ def _tensors(pickle, numbers=300, names=("time", "q")):
 def _lying_tensors(data, rng):
     shape, strides = ([rng.choice([*HUGE, 300, 3, -1]) for _ in range(2)] for _ in range(2))
     shapes = [(shape, strides), ((300,), strides), (shape, (1, 0)), ((300, 0), (1, 1)), ((), ())]
-    one = tensor("time", *rng.choice([(300, (300,), (1,), 10**9), (9, *rng.choice(shapes))]))
-    return _tensors(b"\x80\x02}(Vtime\n" + one + b"u.")
+    entry = tensor("time", *rng.choice([(300, (300,), (1,), 10**9), (9, *rng.choice(shapes))]))
+    return _tensors(b"\x80\x02}(Vtime\n" + entry + b"u.")
 
 
 def _many_tensors(data, rng):
     """Thousands of names of one storage."""
     count, numbers = rng.choice([(3000, 300), (3000, 1_000_000), (20, 30_000_000)])
-    one = tensor("time", numbers, (numbers,), (1,))
-    text = b"".join(b"Vt%d\n" % k + one for k in range(count))
+    entry = tensor("time", numbers, (numbers,), (1,))
+    text = b"".join(b"Vt%d\n" % k + entry for k in range(count))
     pickle = b"\x80\x02}(" + text + b"u."
     if numbers == 300:
         return _tensors(pickle)

@@ -81,18 +81,18 @@ class Sending:
 def senders(folder, buses, *, rate, per_packet, seconds):
     """Start senders to a recorder, one a bus."""
     with ExitStack() as stack:
-        found = []
+        started = []
         for name in buses:
             log = folder / f"{name}.accepted"
             words = (SENDER, folder / f"{name}.sock", log, rate, per_packet, seconds)
             process = start(stack, sys.executable, *words, stdout=subprocess.PIPE)
-            found.append(Sending(name, process, log))
-        yield found
+            started.append(Sending(name, process, log))
+        yield started
 
 
 def numbers_in(paths, bus):
     """Return the sequence numbers of a bus in the order of the files, by mcap's own reader."""
-    found = []
+    numbers = []
     for path in paths:
         for *_, message in messages_of(path, topics=[f"/can/{bus}"], log_time_order=False):
             data, size = message.data, len(message.data)
@@ -101,8 +101,8 @@ def numbers_in(paths, bus):
             while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
                 at -= RECORD
             ends = range(at + AT_DATA, size, RECORD)
-            found += [struct.unpack_from("<Q", data, end)[0] for end in ends]
-    return found
+            numbers += [struct.unpack_from("<Q", data, end)[0] for end in ends]
+    return numbers
 
 
 def check_kept(folder, sending, least):
@@ -114,13 +114,13 @@ def check_kept(folder, sending, least):
         numbers = numbers_in(paths, sending.bus)
     except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
         return [f"output: unreadable: {type(error).__name__}: {error}"]
-    found = []
+    failures = []
     if numbers != list(range(len(numbers))):
         wrong = next(k for k, number in enumerate(numbers) if k != number)
-        found.append(f"lost: frame {wrong} of {sending.bus} is followed by {numbers[wrong]}")
+        failures.append(f"lost: frame {wrong} of {sending.bus} is followed by {numbers[wrong]}")
     if len(numbers) < least:
-        found.append(f"lost: {least - len(numbers)} of {least} accepted frames of {sending.bus}")
-    return found
+        failures.append(f"lost: {least - len(numbers)} of {least} accepted frames of {sending.bus}")
+    return failures
 
 
 def end(running, by=signal.SIGTERM):

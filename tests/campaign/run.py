@@ -122,7 +122,7 @@ def plan(names, seed, cases, *, short):
     """
     jobs = []
     whole = sum(PARTS[name].long for name in names)
-    for name in sorted(names, key=lambda one: not PARTS[one].alone):
+    for name in sorted(names, key=lambda part: not PARTS[part].alone):
         part = PARTS[name]
         count = part.short if short else part.long
         if cases is not None:
@@ -141,8 +141,8 @@ def run_all(jobs, workers):
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         for start in range(0, len(beside), 2000):
             waiting = [pool.submit(_work, *job) for job in beside[start : start + 2000]]
-            for one in waiting:
-                yield one.result()
+            for finished in waiting:
+                yield finished.result()
 
 
 class Records:
@@ -177,9 +177,9 @@ def summary(records):
         "|---|---|---|---|---|---|---|",
     ]
     for part in dict.fromkeys(row["part"] for row in records.cases):
-        own = [row for row in records.cases if row["part"] == part]
+        part_rows = [row for row in records.cases if row["part"] == part]
         figures = defaultdict(list)
-        for row in own:
+        for row in part_rows:
             for name, value in row["figures"].items():
                 figures[name].append(value)
         most = {name: max(values) for name, values in figures.items()}
@@ -188,10 +188,10 @@ def summary(records):
             for name, values in figures.items()
             if name not in {"cpu_s", "peak_mib"}
         )
-        failed = sum(bool(row["failures"]) for row in own)
-        skipped = sum(bool(row["skipped"]) for row in own)
+        failed = sum(bool(row["failures"]) for row in part_rows)
+        skipped = sum(bool(row["skipped"]) for row in part_rows)
         lines.append(
-            f"| {part} | {len(own)} | {failed} | {skipped} | {most.get('cpu_s', 0):.1f} "
+            f"| {part} | {len(part_rows)} | {failed} | {skipped} | {most.get('cpu_s', 0):.1f} "
             f"| {most.get('peak_mib', 0):.0f} | {other} |"
         )
     kinds = defaultdict(list)
@@ -200,9 +200,9 @@ def summary(records):
             kind = f"{' '.join(row['case'].split()[:2])}: {kind_of(failure)}"
             kinds[row["part"], kind].append((row["seed"], row["case"], failure))
     lines.append("")
-    for (part, kind), found in sorted(kinds.items(), key=lambda item: -len(item[1])):
-        seed, case, failure = found[0]
-        lines.append(f"{len(found):5} x {part}: {kind}\n        {part}:{seed} `{case}`: {failure}")
+    for (part, kind), cases in sorted(kinds.items(), key=lambda item: -len(item[1])):
+        seed, case, failure = cases[0]
+        lines.append(f"{len(cases):5} x {part}: {kind}\n        {part}:{seed} `{case}`: {failure}")
     reasons = Counter(row["skipped"] for row in records.cases if row["skipped"])
     lines += [f"skipped {count} x: {why}" for why, count in reasons.items()]
     return lines

@@ -109,11 +109,11 @@ def _descriptors(pid):
 
 
 def _targets(pid):
-    found = Counter[str]()
+    targets = Counter[str]()
     for link in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(OSError):  # closed meanwhile
-            found[str(link.readlink()).split("[")[0]] += 1
-    return ", ".join(f"{count} x {target}" for target, count in found.items())
+            targets[str(link.readlink()).split("[")[0]] += 1
+    return ", ".join(f"{count} x {target}" for target, count in targets.items())
 
 
 def _check_descriptors(result, pid, before, of=""):
@@ -231,8 +231,8 @@ def viewer(result, folder, rng, stage):
     out = folder.parent / f"{folder.name}.out"
 
     def ready():
-        found = out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
-        return ("127.0.0.1", int(found.group(1))) if found else None
+        match = out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
+        return ("127.0.0.1", int(match.group(1))) if match else None
 
     words = ["view", "gait.mcap", "--web"]
     page = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"

@@ -62,10 +62,10 @@ class Stage:
                 if kind in WHOLE and not left_out:
                     seen.add(verb)
                     cases.append(Case(tuple(shlex.split(line.format(file=base.name))), files))
-        found = warm(cases, self.fresh)
+        failures = warm(cases, self.fresh)
         gc.collect()
         gc.freeze()  # forked processes share what is here
-        return found
+        return failures
 
     @contextmanager
     def fresh(self):

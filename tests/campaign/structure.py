@@ -10,13 +10,13 @@ from .packed import PACKED, one_of
 # -- JSON ----------------------------------------------------------------------------------
 
 
-def _places(value, found):
+def _places(value, places):
     items = value.items() if isinstance(value, dict) else enumerate(value)
     for key, inner in list(items):
-        found.append((value, key))
+        places.append((value, key))
         if isinstance(inner, dict | list):
-            _places(inner, found)
-    return found
+            _places(inner, places)
+    return places
 
 
 def _odd_json(data, rng):

@@ -30,7 +30,7 @@ class Reader:
 
     def until(self, condition):
         """Poll until something is so; fails after a long time."""
-        wait_for(condition, f"{self.counts}, {self.texts}", each=self.poll)
+        wait_for(condition, f"{self.counts}, {self.texts}", meanwhile=self.poll)
 
     def until_frames(self, count):
         self.until(lambda: sum(map(len, self.arrays)) >= count)

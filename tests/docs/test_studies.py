@@ -30,7 +30,7 @@ def shows_the_conclusions_of_the_study(folder, _):
     assert {verdict.conclusion.name for verdict in verdicts if verdict.holds is None} == NEEDS_MORE
     assert [verdict for verdict in verdicts if verdict.holds is False] == []
     page = (folder / "study.md").read_text()
-    for name in (one.name for one in CONCLUSIONS):
+    for name in (conclusion.name for conclusion in CONCLUSIONS):
         assert f"`{name}`" in page
 
 

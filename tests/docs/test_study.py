@@ -19,21 +19,21 @@ LONG = STUDIES / "study/rows/long.parquet"
 @pytest.mark.built("study")
 def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     results = results_of(LONG)
-    assert [one for one in evaluate(results) if not one.holds] == []
+    assert [conclusion for conclusion in evaluate(results) if not conclusion.holds] == []
     assert results.digest in (DOCS / "study.md").read_text()
 
 
 def test_both_engines_give_the_same_couplings_and_predict_up_to_50_joints():
-    found = prediction.rows(STUDIES / "study/rows/prediction")
+    rows = prediction.rows(STUDIES / "study/rows/prediction")
     chain = ["n", "law", "stall", "amplitude"]
-    engines = [found[(found.kind == "P") & (found.engine == one)] for one in prediction.ENGINES]
+    engines = [rows[(rows.kind == "P") & (rows.engine == engine)] for engine in prediction.ENGINES]
     pairs = engines[0].merge(engines[1], on=chain)
     assert {*zip(pairs.n, pairs.law, strict=True)} >= {
         *itertools.product(prediction.SIZES, prediction.LAWS)
     }
     for first, other in zip(pairs.P_x, pairs.P_y, strict=True):
         np.testing.assert_allclose(np.vstack(first), np.vstack(other), rtol=0, atol=1e-9)
-    longest = prediction.summary(found[(found.kind == "kick") & (found.n == 50)])
+    longest = prediction.summary(rows[(rows.kind == "kick") & (rows.n == 50)])
     assert {*zip(longest.engine, longest.law, strict=True)} == {
         *itertools.product(prediction.ENGINES, prediction.LAWS)
     }
@@ -50,15 +50,15 @@ def test_kicks_as_rows_give_the_matrix_of_a_kick_experiment(n, stall, gap, homog
     """docs/explanation/oscillators.md has these, from sessions by ``analyse_experiment``."""
     rows = read_rows(LONG)
     rows = rows[rows["plan"] == f"kicks-{n}-{stall}"]
-    one = coupling.measures(coupling.kicked(rows)).iloc[0]
-    assert one["gap"] == pytest.approx(gap, abs=5e-4)
-    assert one["homogeneous_gap"] == pytest.approx(homogeneous, abs=5e-4)
-    assert one["explicit"] == pytest.approx(explicit, abs=5e-3)
+    row = coupling.measures(coupling.kicked(rows)).iloc[0]
+    assert row["gap"] == pytest.approx(gap, abs=5e-4)
+    assert row["homogeneous_gap"] == pytest.approx(homogeneous, abs=5e-4)
+    assert row["explicit"] == pytest.approx(explicit, abs=5e-3)
 
 
 def test_statements_rest_on_conclusions_that_exist():
-    names = {one.name for one in CONCLUSIONS}
-    assert {name for one in statements.STATEMENTS for name in one.conclusions} <= names
+    names = {conclusion.name for conclusion in CONCLUSIONS}
+    assert {name for statement in statements.STATEMENTS for name in statement.conclusions} <= names
 
 
 @pytest.mark.parametrize("n", [5, 12])
@@ -82,6 +82,8 @@ def test_a_planted_group_is_found_out_of_sample():
     random = np.random.default_rng(1)
     x, other = random.normal(size=(2, 200))
     y = -1.3 * x + random.normal(0.0, 0.1, 200)
-    good, bad = (heterogeneity.held_out([heterogeneity.quadratic(one)], y)[0] for one in (x, other))
+    good, bad = (
+        heterogeneity.held_out([heterogeneity.quadratic(inputs)], y)[0] for inputs in (x, other)
+    )
     assert good > 0.98
     assert bad < 0.05

@@ -61,18 +61,18 @@ def words(sentence: str) -> list[str]:
     return _WORD.findall(sentence)
 
 
-def faults(page: str, known: SpellChecker) -> Iterator[str]:
+def faults(page: str, spelling: SpellChecker) -> Iterator[str]:
     """Return what a page's prose has against these rules, a line each."""
     standard = {word: term for some, term in STANDARD.items() for word in some.split(", ")}
     for sentence in sentences(page):
-        found = words(sentence)
-        if len(found) > MOST_WORDS:
-            yield f"{len(found)} words, {MOST_WORDS} at most: {sentence}"
-        for word in found:
+        words_of = words(sentence)
+        if len(words_of) > MOST_WORDS:
+            yield f"{len(words_of)} words, {MOST_WORDS} at most: {sentence}"
+        for word in words_of:
             plain = word.lower().replace("’", "'").removesuffix("'s")
             if plain in standard:
                 yield f"{word!r} has a standard term, {standard[plain]}: {sentence}"
-            elif len(plain) > 2 and plain not in known and "'" not in plain:
+            elif len(plain) > 2 and plain not in spelling and "'" not in plain:
                 yield f"{word!r} is in no dictionary, nor in {WORDS.name}: {sentence}"
 
 
@@ -85,11 +85,11 @@ def dictionary() -> SpellChecker:
 
 def main() -> int:
     """Print the faults of all pages; return the exit code."""
-    known = dictionary()
+    spelling = dictionary()
     lines = [
         f"{page.relative_to(ROOT)}: {fault}"
         for page in PAGES
-        for fault in faults(page.read_text(), known)
+        for fault in faults(page.read_text(), spelling)
     ]
     print("\n".join(lines) or f"{len(PAGES)} pages read well.")
     return 1 if lines else 0

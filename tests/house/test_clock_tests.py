@@ -190,27 +190,27 @@ EXEMPT = {
 
 def reads_a_clock(node):
     """Whether code calls a clock, sleeps, or waits for a short time."""
-    for one in ast.walk(node):
-        if isinstance(one, ast.Attribute) and isinstance(one.value, ast.Name):
-            if (one.value.id, one.attr) in CLOCKS:
+    for part in ast.walk(node):
+        if isinstance(part, ast.Attribute) and isinstance(part.value, ast.Name):
+            if (part.value.id, part.attr) in CLOCKS:
                 return True
-        elif isinstance(one, ast.ImportFrom) and one.module in {"time", "threading"}:
-            if one.module == "time" or "Timer" in {alias.name for alias in one.names}:
+        elif isinstance(part, ast.ImportFrom) and part.module in {"time", "threading"}:
+            if part.module == "time" or "Timer" in {alias.name for alias in part.names}:
                 return True
-        elif isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute):
-            limits = [*one.args, *(word.value for word in one.keywords if word.arg == "timeout")]
-            if one.func.attr in WAITS and any(is_short(limit) for limit in limits):
+        elif isinstance(part, ast.Call) and isinstance(part.func, ast.Attribute):
+            limits = [*part.args, *(word.value for word in part.keywords if word.arg == "timeout")]
+            if part.func.attr in WAITS and any(is_short(limit) for limit in limits):
                 return True
     return False
 
 
 def gives_time(node):
     """Whether code gives processes time, as stages under ``tests/support`` may."""
-    for one in ast.walk(node):
-        if isinstance(one, ast.ImportFrom) and one.module == "support.processes":
-            if "pause" in {alias.name for alias in one.names}:
+    for part in ast.walk(node):
+        if isinstance(part, ast.ImportFrom) and part.module == "support.processes":
+            if "pause" in {alias.name for alias in part.names}:
                 return True
-        elif isinstance(one, ast.Attribute) and ast.unparse(one) == "processes.pause":
+        elif isinstance(part, ast.Attribute) and ast.unparse(part) == "processes.pause":
             return True
     return False
 
@@ -233,22 +233,28 @@ def looked_at(path):
     A helper, class or fixture may read one if all that name it are marked.
     """
     body = ast.parse(path.read_text()).body
-    named = {one.name: one for one in body if isinstance(one, ast.FunctionDef | ast.ClassDef)}
+    named = {
+        definition.name: definition
+        for definition in body
+        if isinstance(definition, ast.FunctionDef | ast.ClassDef)
+    }
     marks = [
-        one.value
-        for one in body
-        if isinstance(one, ast.Assign) and "pytestmark" in map(ast.unparse, one.targets)
+        statement.value
+        for statement in body
+        if isinstance(statement, ast.Assign) and "pytestmark" in map(ast.unparse, statement.targets)
     ]
-    marked = {name for name, one in named.items() if is_clock([*marks, *one.decorator_list])}
+    marked = {
+        name for name, definition in named.items() if is_clock([*marks, *definition.decorator_list])
+    }
     tests = {name for name in named if name.startswith("test_")}
-    tainted = {name for name, one in named.items() if reads_a_clock(one)}
-    others = [one for one in body if one not in named.values()]
+    tainted = {name for name, definition in named.items() if reads_a_clock(definition)}
+    others = [statement for statement in body if statement not in named.values()]
     wrong = {"the module" for other in others if reads_a_clock(other)}
     while True:
         users = {
             name
-            for name, one in named.items()
-            if name not in marked and names_of(one) & (tainted - tests)
+            for name, definition in named.items()
+            if name not in marked and names_of(definition) & (tainted - tests)
         }
         if users <= tainted:
             break
@@ -260,10 +266,10 @@ def looked_at(path):
 def names_of(*nodes):
     """Return the names that code uses, arguments included, which may be fixtures."""
     return {
-        one.id if isinstance(one, ast.Name) else one.arg
+        part.id if isinstance(part, ast.Name) else part.arg
         for node in nodes
-        for one in ast.walk(node)
-        if isinstance(one, ast.Name | ast.arg)
+        for part in ast.walk(node)
+        if isinstance(part, ast.Name | ast.arg)
     }
 
 
@@ -278,7 +284,7 @@ def test_no_other_test_reads_a_clock():
             wrong.append(f"{name}: pause")
         if MAY_READ_A_CLOCK.search(text):
             of_clock, faults = looked_at(path)
-            marked += [f"{name}::{one}" for one in of_clock]
+            marked += [f"{name}::{test}" for test in of_clock]
             wrong += [f"{name}: {fault}" for fault in sorted(faults)]
     assert not wrong
     assert 0 < len(marked) <= MOST_CLOCK_TESTS

@@ -100,26 +100,26 @@ def copy_conftest(folder):
 
 def running(folder):
     """Return the names of the processes that a run in a folder has left."""
-    found = []
+    names = []
     for cwd in Path("/proc").glob("[0-9]*/cwd"):
         with contextlib.suppress(OSError):
             if cwd.readlink() == folder:
-                found.append((cwd.parent / "cmdline").read_bytes().replace(b"\0", b" "))
-    return found
+                names.append((cwd.parent / "cmdline").read_bytes().replace(b"\0", b" "))
+    return names
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("variable", "wanted"),
+    ("variable", "expected"),
     [("", {"slow"}), ("BUILD_PAGES", {"slow", "built"}), ("NIGHTLY", {"slow", "nightly"})],
 )
-def test_a_marker_leaves_its_tests_to_their_target(tmp_path, variable, wanted):
+def test_a_marker_leaves_its_tests_to_their_target(tmp_path, variable, expected):
     copy_conftest(tmp_path)
     (tmp_path / "test_marked.py").write_text(MARKED)
     words = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider"]
     inherited = {k: v for k, v in os.environ.items() if not k.endswith(("BUILD_PAGES", "NIGHTLY"))}
     done = run(*words, tmp_path, cwd=tmp_path, env=inherited | {f"UNDULOG_{variable}": "1"})
-    assert set(re.findall(r"::test_(\w+)", done.stdout)) == wanted, done.stdout
+    assert set(re.findall(r"::test_(\w+)", done.stdout)) == expected, done.stdout
 
 
 @pytest.mark.parametrize(

@@ -73,9 +73,9 @@ def test_what_is_left_is_what_was_synced(disk):
         "sub/lost": b"four",
         "last": bytes(5),
     }
-    found = disk.after(Loss.EVERYTHING)
-    assert contents(found) == common | everything
-    assert (found / "sub").is_dir()
+    left = disk.after(Loss.EVERYTHING)
+    assert contents(left) == common | everything
+    assert (left / "sub").is_dir()
     assert contents(disk.after(Loss.BYTES)) == common | zeros
 
 

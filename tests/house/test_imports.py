@@ -33,6 +33,6 @@ def test_no_circle_of_folders(graph):
 
     folders = {}
     for name, targets in graph.items():
-        found = {folder(target) for target in targets} - {folder(name)}
-        folders.setdefault(folder(name), set()).update(found)
+        others = {folder(target) for target in targets} - {folder(name)}
+        folders.setdefault(folder(name), set()).update(others)
     assert list(TopologicalSorter(folders).static_order())

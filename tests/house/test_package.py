@@ -60,15 +60,17 @@ def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree,
     (unpacked,) = (tree.parent / "unpacked").iterdir()
     names = [str(Path(member.name).relative_to(unpacked.name)) for member in members]
     assert len(set(names)) == len(names)
-    assert not [name for name in names if name.startswith(tuple(f"{one}/" for one in FOLDERS))]
+    assert not [
+        name for name in names if name.startswith(tuple(f"{folder}/" for folder in FOLDERS))
+    ]
     run(*BUILD, "-t", "wheel", "-d", tree.parent / "again", cwd=unpacked)
     assert record(next((tree.parent / "again").glob("*.whl"))) == record(wheel)
 
 
 def test_the_wheel_holds_every_file_of_the_packages(wheel):
     expected = {f"undulog/{path.relative_to(ROOT)}" for path in tracked(*FOLDERS)}
-    own = ("__init__.py", "__main__.py", "notebook.py", "py.typed")
-    expected |= {f"undulog/{name}" for name in own}
+    roots = ("__init__.py", "__main__.py", "notebook.py", "py.typed")
+    expected |= {f"undulog/{name}" for name in roots}
     assert {name for name in record(wheel) if not name.startswith("undulog-")} == expected
 
 
@@ -151,15 +153,15 @@ def _imports(tree):
 
 @pytest.mark.nightly
 def test_no_file_names_a_package_without_undulog_or_its_own_package_with_it():
-    found = []
+    inside = []
     for path in tracked("*.py"):
         name = path.relative_to(ROOT)
         for imported in _imports(ast.parse(path.read_text())):
             first, *rest = imported.split(".")
-            own = first == "undulog" and rest[:1] == [name.parts[0]]
-            if (first in FOLDERS) or (own and name.parts[0] in FOLDERS):
-                found.append(f"{name}: {imported}")
-    assert found == []
+            qualified = first == "undulog" and rest[:1] == [name.parts[0]]
+            if (first in FOLDERS) or (qualified and name.parts[0] in FOLDERS):
+                inside.append(f"{name}: {imported}")
+    assert inside == []
 
 
 MODULE = re.compile(
@@ -169,12 +171,12 @@ MODULE = re.compile(
 
 
 def test_no_text_or_string_names_a_module_without_undulog():
-    found = []
+    named = []
     for path in tracked("*.py", "*.md", "*.ipynb", "*.toml", "*.service", ".ci", "Makefile"):
         if path.name == "CHANGELOG.md":
             continue
         for match in MODULE.finditer(path.read_text()):
             module = ROOT.joinpath(*match["name"].split(".")[:2])
             if module.is_dir() or module.with_suffix(".py").exists():
-                found.append(f"{path.relative_to(ROOT)}: {match[0]}")
-    assert found == []
+                named.append(f"{path.relative_to(ROOT)}: {match[0]}")
+    assert named == []

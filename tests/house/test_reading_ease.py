@@ -6,7 +6,7 @@ from house import reading_ease
 
 
 @pytest.fixture(scope="module")
-def known():
+def spelling():
     return reading_ease.dictionary()
 
 
@@ -22,9 +22,9 @@ LONG = " ".join(["word"] * 31)
         ("* One [amplitde](amplitude.md) in a link.", "'amplitde'"),
     ],
 )
-def test_a_fault_is_named(page, fault, known):
-    (found,) = reading_ease.faults(page, known)
-    assert fault in found
+def test_a_fault_is_named(page, fault, spelling):
+    (complaint,) = reading_ease.faults(page, spelling)
+    assert fault in complaint
 
 
 @pytest.mark.parametrize(
@@ -38,8 +38,8 @@ def test_a_fault_is_named(page, fault, known):
         "undulog analyses MCAP files of ROS 2, the robot's too.",
     ],
 )
-def test_what_is_in_order_passes(page, known):
-    assert list(reading_ease.faults(page, known)) == []
+def test_what_is_in_order_passes(page, spelling):
+    assert list(reading_ease.faults(page, spelling)) == []
 
 
 def test_the_words_of_the_project_are_sorted_and_needed():

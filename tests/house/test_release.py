@@ -30,27 +30,30 @@ def pins():
 
 
 def test_the_bill_has_every_package_of_the_lock_with_its_files(bill):
-    counter = Counter((one["name"], one["version"]) for one in bill["components"])
+    counter = Counter((component["name"], component["version"]) for component in bill["components"])
     assert counter == Counter(
         (re.sub(r"[._]", "-", pin.name), next(iter(pin.specifier)).version) for pin in pins()
     )
-    files = [one["externalReferences"][0]["hashes"] for one in bill["components"]]
+    files = [component["externalReferences"][0]["hashes"] for component in bill["components"]]
     assert sum(map(len, files)) == (ROOT / "requirements.lock").read_text().count("--hash=sha256:")
     assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
     assert datetime.fromisoformat(bill["metadata"]["timestamp"]).timestamp() == 86400
 
 
 def test_the_bill_tells_base_extras_and_development_apart(bill):
-    scopes = {one["name"]: one["scope"] for one in bill["components"]}
-    wanted = {"numpy": "required", "wrapt": "required", "pybullet": "optional"}
-    wanted |= {"kiwisolver": "optional", "pytest": "excluded"}
-    assert {name: scopes[name] for name in wanted} == wanted
-    needs = {one["ref"].partition("@")[0]: one["dependsOn"] for one in bill["dependencies"]}
+    scopes = {component["name"]: component["scope"] for component in bill["components"]}
+    expected = {"numpy": "required", "wrapt": "required", "pybullet": "optional"}
+    expected |= {"kiwisolver": "optional", "pytest": "excluded"}
+    assert {name: scopes[name] for name in expected} == expected
+    needs = {
+        dependency["ref"].partition("@")[0]: dependency["dependsOn"]
+        for dependency in bill["dependencies"]
+    }
     assert {ref.partition("@")[0] for ref in needs["pkg:pypi/mcap"]} == {
         "pkg:pypi/lz4",
         "pkg:pypi/zstandard",
     }
-    refs = {one["bom-ref"] for one in bill["components"]}
+    refs = {component["bom-ref"] for component in bill["components"]}
     assert {ref for refs_ in needs.values() for ref in refs_} <= refs
 
 

@@ -64,16 +64,16 @@ def test_every_name_can_be_imported_and_no_other():
 
 @pytest.mark.nightly
 def test_paths_and_open_sessions_give_the_same(runs):
-    one = undulog.analyse(runs / "a.mcap")
+    single = undulog.analyse(runs / "a.mcap")
     with undulog.Session.open(runs / "a.mcap") as session:
         again = undulog.analyse(session)
         assert session.duration_s == pytest.approx(8.0, abs=0.1)
-    assert one.joints == again.joints
+    assert single.joints == again.joints
     several = undulog.analyse(runs / "a.mcap", str(runs / "b.mcap"))
     assert isinstance(several, undulog.Experiment)
-    found = undulog.compare(runs / "a.mcap", [runs / "b.mcap"])
-    assert "servo.stall_torque" in str(found)
-    for result in (one, several, found):
+    comparison = undulog.compare(runs / "a.mcap", [runs / "b.mcap"])
+    assert "servo.stall_torque" in str(comparison)
+    for result in (single, several, comparison):
         assert "<table" in result._repr_html_()
 
 
@@ -94,12 +94,12 @@ def test_a_strangers_program_is_typed_by_the_installed_wheel(tmp_path):
     (site / "dependencies.pth").write_text(f"{ours}\n")
     (tmp_path / "stranger.py").write_text(STRANGER)
     check = (sys.executable, "-m", "pyright", "--pythonpath", tmp_path / "venv/bin/python")
-    found = processes.run(*check, "stranger.py", cwd=tmp_path).stdout
-    types = {line.rpartition(" is ")[2] for line in found.splitlines() if "information:" in line}
-    assert {'"Analysis"', '"Experiment"', '"Comparison"', '"Estimate"'} <= types, found
-    assert not [one for one in types if "Unknown" in one], found
-    errors = [line for line in found.splitlines() if " error: " in line]
-    assert len(errors) == 1, found
+    output = processes.run(*check, "stranger.py", cwd=tmp_path).stdout
+    types = {line.rpartition(" is ")[2] for line in output.splitlines() if "information:" in line}
+    assert {'"Analysis"', '"Experiment"', '"Comparison"', '"Estimate"'} <= types, output
+    assert not [shown for shown in types if "Unknown" in shown], output
+    errors = [line for line in output.splitlines() if " error: " in line]
+    assert len(errors) == 1, output
     assert "stranger.py:20:" in errors[0]
 
 
@@ -131,13 +131,15 @@ def test_a_notebook_has_one_thread_of_linear_algebra_while_it_analyses(runs, mon
     seen, analyse_session = [], undulog.analysis.analyse_session
 
     def watched(*args):
-        seen.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+        seen.extend(
+            library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+        )
         return analyse_session(*args)
 
     monkeypatch.setattr("undulog.analysis.analyse_session", watched)
     with threadpool_limits(2, "blas"):
-        before = [one["num_threads"] for one in threadpool_info()]
+        before = [library["num_threads"] for library in threadpool_info()]
         undulog.analyse(runs / "a.mcap")
-        assert [one["num_threads"] for one in threadpool_info()] == before
+        assert [library["num_threads"] for library in threadpool_info()] == before
     assert seen
     assert set(seen) == {1}

@@ -212,10 +212,10 @@ def test_entities_and_documents_of_rerun_are_as_meant(folder, run):
 class _Tags(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.found = []
+        self.seen = []
 
     def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
+        self.seen.append((tag, dict(attrs)))
 
 
 @pytest.mark.parametrize(
@@ -228,8 +228,8 @@ def test_pages_have_no_markup_from_names(folder, run, command):
     tags.feed(text)
     assert raw(text) <= {"\t"}
     assert "alert(1)" in text
-    assert not [attr for tag, attrs in tags.found for attr in attrs if attr.startswith("on")]
-    assert not [a for _, a in tags.found if "javascript:" in (a.get("href") or "")]
+    assert not [attr for tag, attrs in tags.seen for attr in attrs if attr.startswith("on")]
+    assert not [a for _, a in tags.seen if "javascript:" in (a.get("href") or "")]
     assert text.count("<script>alert") == 0
 
 

@@ -69,8 +69,8 @@ class Mutant:
 def modules(roots):
     """Return the modules below some folders, or modules themselves."""
     paths = [ROOT / root for root in roots]
-    found = [path for path in paths if path.is_file()]
-    return found + [one for path in paths if path.is_dir() for one in sorted(path.rglob("*.py"))]
+    files = [path for path in paths if path.is_file()]
+    return files + [file for path in paths if path.is_dir() for file in sorted(path.rglob("*.py"))]
 
 
 def mutants_of(path):
@@ -80,33 +80,33 @@ def mutants_of(path):
 
     text = path.read_text()
     quiet, nodes = annotations_of(text), list(ast_nodes(get_ast(text)))
-    name, found = path.relative_to(ROOT).as_posix(), []
+    name, mutants = path.relative_to(ROOT).as_posix(), []
     for operator_name in operator_names():
         kind = get_operator(operator_name)
         if operator_name in LEFT_OUT or kind.arguments():
             continue
         places = [start for node in nodes for start, _ in kind().mutation_positions(node)]
-        found += [
+        mutants += [
             Mutant(name, line, column, operator_name, occurrence)
             for occurrence, (line, column) in enumerate(places)
             if not any(first <= (line, column) < last for first, last in quiet)
         ]
-    return found
+    return mutants
 
 
 def annotations_of(text):
     """Return where annotations are: from, to, as (line, column)."""
-    found = []
+    spans = []
     for node in ast.walk(ast.parse(text)):
         for field in ("annotation", "returns"):
             part = getattr(node, field, None)
             if part is not None:
-                found.append(
+                spans.append(
                     ((part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset))
                 )
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            found.append(((node.lineno, 0), (node.end_lineno + 1, 0)))
-    return found
+            spans.append(((node.lineno, 0), (node.end_lineno + 1, 0)))
+    return spans
 
 
 def drawn(seed, count, parts=None):
@@ -119,7 +119,7 @@ def drawn(seed, count, parts=None):
                 places.setdefault((mutant.path, mutant.line, mutant.column), []).append(mutant)
         share = count // len(parts) + (number < count % len(parts))
         some = rng.sample(sorted(places), min(share, len(places)))
-        chosen += [one for place in some if (one := _planted(sorted(places[place]), rng))]
+        chosen += [planted for place in some if (planted := _planted(sorted(places[place]), rng))]
     return chosen
 
 
@@ -129,11 +129,13 @@ def _planted(mutants, rng):
     from cosmic_ray.plugins import get_operator
 
     while mutants:
-        one = rng.choice(mutants)
+        mutant = rng.choice(mutants)
         with contextlib.suppress(AttributeError):
-            mutate_code((ROOT / one.path).read_text(), get_operator(one.operator)(), one.occurrence)
-            return one
-        mutants = [other for other in mutants if other != one]
+            mutate_code(
+                (ROOT / mutant.path).read_text(), get_operator(mutant.operator)(), mutant.occurrence
+            )
+            return mutant
+        mutants = [other for other in mutants if other != mutant]
     return None
 
 
@@ -146,7 +148,7 @@ def tests_of(path):
     if not files:
         return [ROOT / "tests" / module.parent]
     names = module.stem
-    return sorted(files, key=lambda one: (dotted not in one.read_text(), names not in one.stem))
+    return sorted(files, key=lambda file: (dotted not in file.read_text(), names not in file.stem))
 
 
 # -- one try -----------------------------------------------------------------------------------
@@ -234,8 +236,10 @@ def summary(rows):
     """Return the share that was killed, by part, and the survivors."""
     lines = ["| part | mutants | killed |", "|---|---|---|"]
     for part, roots in PARTS.items():
-        own = [row for row in rows if any(row["mutant"]["path"].startswith(root) for root in roots)]
-        lines.append(f"| {part} | {len(own)} | {sum(row['killed'] for row in own)} |")
+        part_rows = [
+            row for row in rows if any(row["mutant"]["path"].startswith(root) for root in roots)
+        ]
+        lines.append(f"| {part} | {len(part_rows)} | {sum(row['killed'] for row in part_rows)} |")
     killed = sum(row["killed"] for row in rows)
     lines.append(f"| all | {len(rows)} | {killed}, {killed / max(1, len(rows)):.0%} |")
     lines.append("")
@@ -258,7 +262,7 @@ def main():
     options.output.mkdir(parents=True, exist_ok=True)
     results = Mutants(options.output / f"seed{options.seed}.jsonl")
     chosen = drawn(options.seed, options.count, options.parts)
-    left = [one for one in chosen if one not in results.done]
+    left = [mutant for mutant in chosen if mutant not in results.done]
     with tempfile.TemporaryDirectory(prefix="mutants", ignore_cleanup_errors=True) as name:
         trees = SimpleQueue()
         for number in range(options.jobs):
@@ -278,7 +282,7 @@ def main():
                 trees.put(tree)
 
         with ThreadPoolExecutor(options.jobs) as pool:
-            for row in (results.add(*found) for found in pool.map(work, left)):
+            for row in (results.add(*outcome) for outcome in pool.map(work, left)):
                 place = f"{row['mutant']['path']}:{row['mutant']['line']}"
                 verdict = "killed" if row["killed"] else "SURVIVED"
                 print(f"{verdict} {row['took_s']:.0f} s {place} {row['change']}", flush=True)

@@ -27,16 +27,16 @@ def tree(tmp_path, monkeypatch):
 
 
 def test_what_is_only_for_the_type_checker_is_not_mutated(tree):
-    found = run.mutants_of(tree / "capture" / "area.py")
+    mutants = run.mutants_of(tree / "capture" / "area.py")
     lines = CODE.splitlines()
-    assert {one.line for one in found} == {7, 8}
-    assert {lines[6][one.column] for one in found if one.line == 7} == {"4"}
+    assert {mutant.line for mutant in mutants} == {7, 8}
+    assert {lines[6][mutant.column] for mutant in mutants if mutant.line == 7} == {"4"}
 
 
 def test_draws_are_one_a_place_and_the_same_for_a_seed(tree):
     chosen = run.drawn(3, 100)
     assert chosen == run.drawn(3, 100)
-    assert len({(one.line, one.column) for one in chosen}) == len(chosen) > 1
+    assert len({(mutant.line, mutant.column) for mutant in chosen}) == len(chosen) > 1
     assert {run.drawn(seed, 1)[0].operator for seed in range(40)} > {chosen[0].operator}
 
 
@@ -65,7 +65,7 @@ def test_a_run_goes_on_and_counts_what_survived(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("delay", delays.DELAYS, ids=lambda one: one.test.rpartition("::")[2])
+@pytest.mark.parametrize("delay", delays.DELAYS, ids=lambda delay: delay.test.rpartition("::")[2])
 def test_there_is_a_place_for_each_delay(delay):
     whole = (ROOT / delay.path).read_text()
     assert delays.planted(whole, delay, 2 * delays.tolerance_of(delay.test)) != whole

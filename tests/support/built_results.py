@@ -22,9 +22,9 @@ from undulog.analysis.results.estimate import Estimate, Provenance
 
 def answered(analysis, shape=()):
     """Return the result with the answer to its numbers."""
-    known = tuple(j.name for j in analysis.joints if j.gain.value is not None)
-    findings = Findings(shape=tuple(shape), compared=known)
-    facts = Facts(analysis.gait, analysis.joints, known, (), findings, analysis.warnings)
+    names = tuple(j.name for j in analysis.joints if j.gain.value is not None)
+    findings = Findings(shape=tuple(shape), compared=names)
+    facts = Facts(analysis.gait, analysis.joints, names, (), findings, analysis.warnings)
     return dataclasses.replace(analysis, answer=compose(facts))
 
 
@@ -66,9 +66,11 @@ def points(values, name):
     )
 
 
-def exact(one):
+def exact(harmonic):
     return dataclasses.replace(
-        one, amplitude_m=Estimate(one.amplitude_m.value), phase_rad=Estimate(one.phase_rad.value)
+        harmonic,
+        amplitude_m=Estimate(harmonic.amplitude_m.value),
+        phase_rad=Estimate(harmonic.phase_rad.value),
     )
 
 

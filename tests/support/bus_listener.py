@@ -40,7 +40,7 @@ def main():
             if frame is None or frame.is_error_frame:
                 continue
             message = messages.get(frame.arbitration_id)
-            told = {
+            report = {
                 "t_s": time.monotonic(),
                 "bus_s": frame.timestamp,
                 "id": frame.arbitration_id,
@@ -48,7 +48,7 @@ def main():
                 "data": frame.data.hex(),
                 "signals": message.decode(frame.data, decode_choices=False) if message else {},
             }
-            heard.write(json.dumps(told) + "\n")
+            heard.write(json.dumps(report) + "\n")
 
 
 main()

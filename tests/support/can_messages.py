@@ -92,16 +92,16 @@ def fd_traffic(count):
     return frames
 
 
-def same(found, truth):
+def same(frames, truth):
     """Return whether two lots of frames agree in everything but times."""
     classic = truth.dtype == fr.empty_frames(0).dtype
     names = ("id_flags", "dlc", "data") if classic else ("id_flags", "len", "fd_flags", "data")
-    return len(found) == len(truth) and all(np.array_equal(found[n], truth[n]) for n in names)
+    return len(frames) == len(truth) and all(np.array_equal(frames[n], truth[n]) for n in names)
 
 
 @contextmanager
-def speaking(channel, each):
+def speaking(channel, speak):
     """Somebody on a virtual bus of python-can, every 10 ms."""
     bus = can.Bus(interface="virtual", channel=channel)
-    with bus, repeating(lambda: each(bus), 0.01):
+    with bus, repeating(lambda: speak(bus), 0.01):
         yield bus

@@ -43,8 +43,8 @@ def at(tick):
 
 
 def timing_of(health, topic="/joint_states"):
-    (found,) = [series.timing for series in health.series if series.topic == topic]
-    return found
+    (timing,) = [series.timing for series in health.series if series.topic == topic]
+    return timing
 
 
 def write_raw(path, sequences, **options):

@@ -107,7 +107,7 @@ def open_loop(folder, m, held_out=()):
 def base_response(experiment):
     """Return the yaw joints' response to the gait: gain exp(-j lag), shape (m,)."""
     yaw = [joint for joint in experiment.sessions[0].joints if joint.gain.value is not None]
-    return np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
+    return np.array([joint.gain.value * np.exp(-1j * joint.lag_rad.value) for joint in yaw])
 
 
 def closed_loop(folder, coupling, ratio):
@@ -118,7 +118,7 @@ def closed_loop(folder, coupling, ratio):
         coupling: Of the kicks: P and R.
         ratio: The response to the gait: gain exp(-j lag), shape (m,).
     """
-    P, R = (np.array(one.value) for one in (coupling.P, coupling.R))
+    P, R = (np.array(estimate.value) for estimate in (coupling.P, coupling.R))
     felt = felt_response(ratio, OMEGA, AGE_S)
     kicked = _phases(folder, "kicked", felt.imag, kick_every_s=KICK_AT_S, kick_size=LARGEST)
     off = kicked - _phases(folder, "free", felt.imag)

@@ -54,9 +54,9 @@ def seen(color, deficiency="none"):
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def difference(one, other):
+def difference(first, other):
     """CIEDE2000 of two colours in CIELAB (CIE 142-2001; Sharma, Wu, Dalal 2005, Eq. 2 to 22)."""
-    (l1, a1, b1), (l2, a2, b2) = one, other
+    (l1, a1, b1), (l2, a2, b2) = first, other
     mean_7 = ((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2) ** 7
     g = 0.5 * (1 - np.sqrt(mean_7 / (mean_7 + 25.0**7)))
     a1, a2 = (1 + g) * a1, (1 + g) * a2
@@ -87,7 +87,7 @@ def luminance(color):
     return linear(color) @ (0.2126, 0.7152, 0.0722)
 
 
-def contrast(one, other):
+def contrast(first, other):
     """Contrast ratio of two colours (WCAG 2.2)."""
-    dark, light = sorted(luminance(color) + 0.05 for color in (one, other))
+    dark, light = sorted(luminance(color) + 0.05 for color in (first, other))
     return light / dark

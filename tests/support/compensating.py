@@ -97,8 +97,8 @@ def gait_run(joints, wave, command, response):
 def indices(runs, wave):
     """Return CV of gain and spread of lag against the wanted wave, of several runs together."""
     pooled = pool_runs(names(wave.m), [run.against(wave) for run in runs])
-    found = response_indices(pooled.response)
-    return found["gain_cv"], found["lag_sd"]
+    values = response_indices(pooled.response)
+    return values["gain_cv"], values["lag_sd"]
 
 
 def ratio(after, before):
@@ -146,12 +146,12 @@ class Stage:
         times_s = np.arange(scenario.tick_count) / 100
         given = [
             np.array([gait.step(t, None).command for t in times_s])
-            for gait in (Sines(one, wave.omega) for one in turned)
+            for gait in (Sines(phasors, wave.omega) for phasors in turned)
         ]
         runs = run_batch([scenario] * len(given), commands=given)
         return [
-            self._driven(wave, command, one, random, run)
-            for command, one, random, run in zip(commands, turned, randoms, runs, strict=True)
+            self._driven(wave, command, phasors, random, run)
+            for command, phasors, random, run in zip(commands, turned, randoms, runs, strict=True)
         ]
 
     def _driven(self, wave, command, turned, random, run):
@@ -183,9 +183,14 @@ class Stage:
         m, unit = self.m, np.eye(self.m)
         random = np.random.default_rng(seed)
         off = [np.zeros(m, dtype=complex)] * BASE_RUNS
-        off += [s * step * one for step in (KICK * 1j, KICK) for one in unit for s in (1, -1)]
+        off += [
+            s * step * unit_vector
+            for step in (KICK * 1j, KICK)
+            for unit_vector in unit
+            for s in (1, -1)
+        ]
         off += [1j * random.uniform(-size, size, m) for size in HELD_OUT]
-        commands = [wave.phasors * np.exp(one) for one in off]
+        commands = [wave.phasors * np.exp(change) for change in off]
         runs = self.drive(wave, commands, [[seed, k] for k in range(len(commands))])
         commands = np.array(commands)
         experiment = KickExperiment(
@@ -204,13 +209,13 @@ class Stage:
 
     def compensate(self, coupling, wave, seed, rounds=2, keep=KEEP):
         """Return the commands of each round and what was planned for it."""
-        found, after = [], ()
+        rounds_done, after = [], ()
         for k in range(rounds):
             base = self.base(wave)
             plan, commands = compensation(coupling, base, self.robot, after, keep=keep)
-            found.append((plan, commands))
+            rounds_done.append((plan, commands))
             after = (self.drive(wave, [commands], [[seed, k]])[0].run(),)
-        return found
+        return rounds_done
 
 
 def _response(angles, command, omega):
@@ -218,9 +223,9 @@ def _response(angles, command, omega):
     t_s = SETTLE_S + np.arange(len(angles)) / 100
     turn = np.exp(1j * omega * np.outer(t_s, (1, 2, 3)))
     parts = np.column_stack([np.ones(len(t_s)), t_s, turn.imag, turn.real])
-    found, *_ = np.linalg.lstsq(parts, angles, rcond=None)
-    left = angles - parts @ found
+    coefficients, *_ = np.linalg.lstsq(parts, angles, rcond=None)
+    left = angles - parts @ coefficients
     dof = np.full(angles.shape[1], len(t_s) - parts.shape[1], dtype=float)
-    amplitude = found[2] + 1j * found[5]
+    amplitude = coefficients[2] + 1j * coefficients[5]
     variance = 2 * np.sum(left**2, axis=0) / dof / len(t_s) / np.abs(amplitude) ** 2
     return Response(amplitude / command, variance, variance, dof)

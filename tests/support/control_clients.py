@@ -40,7 +40,7 @@ def connected(server):
 
 def polls(server, until):
     """Poll until a condition holds."""
-    wait_for(until, each=server.poll)
+    wait_for(until, meanwhile=server.poll)
 
 
 def replies(data):

@@ -19,4 +19,4 @@ def on_the_bus(command):
         for frame in ENCODER.frames(command)
     ]
     assert len(decoded) == len(command)
-    return np.radians([one["position"] for one in decoded])
+    return np.radians([frame["position"] for frame in decoded])

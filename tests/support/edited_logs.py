@@ -40,12 +40,12 @@ def write_log(path, messages, *, attachments=(), metadata=(), units=None, **opti
         for name, data in attachments:
             writer.add_attachment(11, 22, name, "text/plain", data)
         channels = {}
-        for k, (topic, t_ns, said) in enumerate(messages):
+        for k, (topic, t_ns, content) in enumerate(messages):
             if topic not in channels:
                 facts = {"unit": (units or {}).get(topic, ""), "made": "elsewhere"}
                 channels[topic] = writer.register_channel(topic, "cdr", schema, facts)
             log_ns = EPOCH_NS + t_ns
-            writer.add_message(channels[topic], log_ns, text(said), log_ns - 5, 7 * k)
+            writer.add_message(channels[topic], log_ns, text(content), log_ns - 5, 7 * k)
     return path
 
 

@@ -173,8 +173,8 @@ def route(port):
     print(listener.getsockname()[1], flush=True)
     client = listener.accept()[0]
     robot = socket.create_connection(("127.0.0.1", port))
-    for each in (client, robot):
-        each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for side in (client, robot):
+        side.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     up, down = Way(client, robot), Way(robot, client)
     sources = [sys.stdin, client, robot]
     while True:
@@ -201,12 +201,12 @@ def largest_burst(arrivals, within_s=0.005):
     """
     worst = 0.0
     for joint in range(JOINTS):
-        own = [(t, angle) for t, number, angle in arrivals if number == joint]
+        changes = [(t, angle) for t, number, angle in arrivals if number == joint]
         first = 0
-        for k in range(1, len(own)):
-            while own[k][0] - own[first][0] > within_s:
+        for k in range(1, len(changes)):
+            while changes[k][0] - changes[first][0] > within_s:
                 first += 1
-            group = [angle for _, angle in own[max(first - 1, 0) : k + 1]]
+            group = [angle for _, angle in changes[max(first - 1, 0) : k + 1]]
             worst = max(worst, max(group) - min(group))
     return worst
 
@@ -217,9 +217,9 @@ def beyond_rate(arrivals, max_rate, period_s):
 
     worst = -math.inf
     for joint in {number for _, number, _ in arrivals}:
-        own = np.array([(t, angle) for t, number, angle in arrivals if number == joint])
-        t, angle = own.T
-        for apart in range(1, min(200, len(own) - 2) + 1):
+        changes = np.array([(t, angle) for t, number, angle in arrivals if number == joint])
+        t, angle = changes.T
+        for apart in range(1, min(200, len(changes) - 2) + 1):
             change = np.abs(angle[apart + 1 :] - angle[: -apart - 1])
             beyond = change - max_rate * (t[apart + 1 :] - t[1:-apart] + period_s)
             worst = max(worst, float(beyond.max()))

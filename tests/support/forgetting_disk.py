@@ -154,9 +154,9 @@ class ForgettingDisk:
         settings |= {"NAME": name, "ROOM": "" if room is None else room}
         environment = {f"FORGETTING_DISK_{key}": str(value) for key, value in settings.items()}
         printed, errors = self._place / "printed", self._place / "errors"
-        found = self._programs.run(program, words, environment, (printed, errors))
-        assert code in (None, found), errors.read_text()
-        return found, printed.read_text().splitlines()
+        status = self._programs.run(program, words, environment, (printed, errors))
+        assert code in (None, status), errors.read_text()
+        return status, printed.read_text().splitlines()
 
     def after(self, loss):
         """Rebuild in a new folder what is there after a loss of power, and return that folder."""
@@ -193,5 +193,5 @@ class ForgettingDisk:
                 self._rebuild_named(entry.path, goal / entry.name)
             elif entry.is_file(follow_symlinks=False):
                 facts = entry.stat()
-                known = self._synced_bytes(facts.st_ino)[: facts.st_size]
-                (goal / entry.name).write_bytes(known.ljust(facts.st_size, b"\0"))
+                synced = self._synced_bytes(facts.st_ino)[: facts.st_size]
+                (goal / entry.name).write_bytes(synced.ljust(facts.st_size, b"\0"))

@@ -12,8 +12,8 @@ def mutable_dataclasses(package):
         package: Its dotted name, or that of a module.
     """
     root = importlib.import_module(package)
-    found = pkgutil.walk_packages(getattr(root, "__path__", []), f"{package}.")
-    modules = [root, *(importlib.import_module(one.name) for one in found)]
+    submodules = pkgutil.walk_packages(getattr(root, "__path__", []), f"{package}.")
+    modules = [root, *(importlib.import_module(module.name) for module in submodules)]
     return {
         name
         for module in modules

@@ -68,19 +68,19 @@ class Bench:
         if change is not None:
             change(angle)
         self.tick += skip
-        found = self.gate.step(self.tick, reading(angle, **more), stop, at_once=at_once)
+        result = self.gate.step(self.tick, reading(angle, **more), stop, at_once=at_once)
         self.tick += 1
-        self.remarks += found.remarks
-        if found.command is not None:
-            self.sent.append(found.command)
-            self.angle = found.command
-        return found
+        self.remarks += result.remarks
+        if result.command is not None:
+            self.sent.append(result.command)
+            self.angle = result.command
+        return result
 
     def until(self, phase, **more):
         for _ in range(2000):
-            found = self.step(**more)
+            result = self.step(**more)
             if self.gate.phase is phase:
-                return found
+                return result
         raise AssertionError(f"never came to {phase}")
 
     def running(self, ticks=0):

@@ -229,7 +229,7 @@ class Driving:
         lines = self.stage.lines
         check_limits(lines)
         written = check_session(self.path, lines)
-        self._check_silence(str(written.said))
+        self._check_silence(str(written.notes))
         return out, err, written
 
 
@@ -238,13 +238,13 @@ class Driving:
 
 def commands_of(lines):
     """Return each joint's commands: name to (monotonic times [s], angles [rad])."""
-    found = {}
+    commands = {}
     for line in lines:
         if (line["name"] or "").endswith("_command"):
             name = line["name"].removesuffix("_command")
             angle = math.radians(line["signals"]["position"])
-            found.setdefault(name, []).append((line["t_s"], angle))
-    return {name: tuple(np.array(rows).T) for name, rows in found.items()}
+            commands.setdefault(name, []).append((line["t_s"], angle))
+    return {name: tuple(np.array(rows).T) for name, rows in commands.items()}
 
 
 def check_limits(lines, *, limit=LIMIT, max_rate=MAX_RATE, period_s=1 / RATE_HZ):
@@ -254,9 +254,9 @@ def check_limits(lines, *, limit=LIMIT, max_rate=MAX_RATE, period_s=1 / RATE_HZ)
     in one control period, however long it really took. The first command is a step from straight
     joints, where the robot stands.
     """
-    found = commands_of(lines)
-    assert found
-    for name, (_, angle) in found.items():
+    commands = commands_of(lines)
+    assert commands
+    for name, (_, angle) in commands.items():
         assert np.abs(angle).max() <= limit + STEP / 2, name
         step = np.abs(np.diff(angle, prepend=0.0))
         assert step.max() <= max_rate * period_s + STEP * (1 + 1e-6), (name, step.max())
@@ -277,17 +277,17 @@ class Written:
     """
 
     def __init__(self, path):
-        self.commands, self.said, self.sent, self.sent_ns = [], [], [], []
+        self.commands, self.notes, self.sent, self.sent_ns = [], [], [], []
         with path.open("rb") as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            self.metadata = {one.name: one.metadata for one in reader.iter_metadata()}
+            self.metadata = {record.name: record.metadata for record in reader.iter_metadata()}
             for _, channel, record, message in reader.iter_decoded_messages():
                 at_s = record.log_time * 1e-9
                 if channel.topic == "/joint_commands":
                     row = zip(message.name, message.position, strict=True)
                     self.commands.append((at_s, dict(row)))
                 elif channel.topic == "/rosout":
-                    self.said.append((at_s, message.level, message.msg))
+                    self.notes.append((at_s, message.level, message.msg))
                 elif channel.topic == "/can/can0":
                     frames = np.frombuffer(bytes(message.data), FRAME)
                     ours = frames[frames["dir"] != 0]
@@ -299,9 +299,9 @@ class Written:
 
     def time_of(self, words):
         """Return when the first event with these words was written [s]."""
-        found = [at_s for at_s, _, text in self.said if words in text]
-        assert found, (words, self.said)
-        return found[0]
+        times = [at_s for at_s, _, text in self.notes if words in text]
+        assert times, (words, self.notes)
+        return times[0]
 
     def after(self, words):
         """Return commands from an event on: joint to angles [rad]."""

@@ -99,22 +99,22 @@ def marked(picture):
     return int((np.abs(picture - np.median(picture, axis=(0, 1))).max(axis=-1) > 60).sum())
 
 
-def differing(found, golden, reach=1):
+def differing(picture, golden, reach=1):
     """Return which pixels of either picture have no like within ``reach`` in the other, (h, w)."""
-    return _lost(found, golden, reach) | _lost(golden, found, reach)
+    return _lost(picture, golden, reach) | _lost(golden, picture, reach)
 
 
-def _lost(one, other, reach):
+def _lost(picture, other, reach):
     around = np.pad(other, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
     there = np.lib.stride_tricks.sliding_window_view(around, ((2 * reach + 1,) * 2), axis=(0, 1))
-    return np.abs(one[..., None, None] - there).max(axis=2).min(axis=(-2, -1)) > FAR
+    return np.abs(picture[..., None, None] - there).max(axis=2).min(axis=(-2, -1)) > FAR
 
 
-def worst_tile(found, golden, reach=1):
+def worst_tile(picture, golden, reach=1):
     """Return the most differing pixels in any tile; all of a tile's where the sizes differ."""
-    if found.shape != golden.shape:
+    if picture.shape != golden.shape:
         return TILE * TILE
-    differs = differing(found, golden, reach)
+    differs = differing(picture, golden, reach)
     height, width = differs.shape
     padded = np.zeros((height + TILE, width + TILE), dtype=int)
     padded[:height, :width] = differs

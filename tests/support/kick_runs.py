@@ -22,15 +22,15 @@ def kicked(random, H, c, kicks, scatter, *, bend=0.0, size=1.0, late=0.0, noise=
     errors = random.normal(size=shape) + 1j * random.normal(size=shape)
     ratio = answers / commands * np.exp(math.hypot(scatter, noise) * errors)
     names = tuple(f"j{k + 1}" for k in range(len(c)))
-    known = np.full(shape, noise**2)
+    variance = np.full(shape, noise**2)
     return KickExperiment(
         index=tuple(range(len(kicks))),
         runs=sort_kicks(commands),
         names=names,
         command=c,
         ratio=ratio,
-        log_gain_variance=known,
-        lag_variance=known,
+        log_gain_variance=variance,
+        lag_variance=variance,
         dof=np.full(shape, 20.0),
         labels=tuple(f"run{k}" for k in range(len(kicks))),
         frequency_hz=0.5,

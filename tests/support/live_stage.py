@@ -36,7 +36,7 @@ class Recorder:
             self.feed.define(definition)
 
     def connect(self):
-        wait_for(lambda: self.feed.connected, each=self.feed.pump)
+        wait_for(lambda: self.feed.connected, meanwhile=self.feed.pump)
 
     def send(self, start_s=0.0, stop_s=np.inf, *, wait=True):
         """Send the messages of a time interval; return the number of ticks."""
@@ -49,10 +49,10 @@ class Recorder:
                 self.feed.pump()
                 ticks += 1
                 if wait:
-                    wait_for(lambda: self.feed.queued == 0, each=self.feed.pump)
+                    wait_for(lambda: self.feed.queued == 0, meanwhile=self.feed.pump)
             self.feed.offer(*message)
         if wait:
-            wait_for(lambda: self.feed.queued == 0, each=self.feed.pump)
+            wait_for(lambda: self.feed.queued == 0, meanwhile=self.feed.pump)
         return ticks
 
     def send_all(self):

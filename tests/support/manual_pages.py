@@ -119,10 +119,10 @@ def walk(page: str, folder: Path) -> None:
             elif step.serves:
                 robots.append(robot := opened(step))
                 printed = robot.stdout.readline()
-                told = (
+                expected = (
                     step.shown if "--wait" in step.line else f"{step.shown.partition(' it ')[0]}..."
                 )
-                assert shows(told, printed), (step.line, printed)
+                assert shows(expected, printed), (step.line, printed)
             elif step.records:
                 recorder = opened(step)
                 wait_for(lambda: _connected(options), "the recorder", alive=(recorder,))
@@ -138,6 +138,6 @@ def walk(page: str, folder: Path) -> None:
 
 
 def _connected(options) -> bool:
-    found = json.loads(undulog("record", "status", "--json", **options).stdout or "{}")
-    recordings = found.get("recordings", [])
+    status = json.loads(undulog("record", "status", "--json", **options).stdout or "{}")
+    recordings = status.get("recordings", [])
     return bool(recordings) and recordings[0]["sources"][0]["connected"]

@@ -31,11 +31,13 @@ class Snake:
         angle = gain * amplitude * np.sin(phase - lag) + rng.normal(0, 0.02, 25)
         rate = OMEGA * gain * amplitude * np.cos(phase - lag)
         self.step = rng.choice(steps)
-        self.position = self.told(angle + rng.normal(0, rng.choice([0.0, 5e-4, 3e-3]), angle.shape))
+        self.position = self.encoded(
+            angle + rng.normal(0, rng.choice([0.0, 5e-4, 3e-3]), angle.shape)
+        )
         self.velocity = rate + rng.normal(0, 0.01, rate.shape)
         self.effort = 0.1 * np.cos(phase - 0.3) + rng.normal(0, 0.002, rate.shape)
 
-    def told(self, angle):
+    def encoded(self, angle):
         """Return the angles as the encoders report them."""
         return np.round(angle / self.step) * self.step if self.step else angle
 

@@ -80,16 +80,16 @@ def serving(scenario, *words, place="0", **options):
         yield robot, json.loads(line)
 
 
-def wait_for(condition, what="", seconds=600.0, *, each=lambda: None, alive=(), pause_s=0.005):
+def wait_for(condition, what="", seconds=600.0, *, meanwhile=lambda: None, alive=(), pause_s=0.005):
     """Return the value of a condition as soon as it holds; the processes ``alive`` must run."""
     deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        for one in alive:
-            assert one.poll() is None, (what, one.communicate())
+    while not (value := condition()):
+        for running in alive:
+            assert running.poll() is None, (what, running.communicate())
         assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
-        each()
+        meanwhile()
         time.sleep(pause_s)
-    return found
+    return value
 
 
 def pause(seconds):
@@ -157,7 +157,8 @@ def freeze(pid):
 
     def states():
         return {
-            (one / "stat").read_text().rpartition(")")[2].split()[0] for one in threads.iterdir()
+            (thread / "stat").read_text().rpartition(")")[2].split()[0]
+            for thread in threads.iterdir()
         }
 
     wait_for(lambda: states() == {"T"}, "all threads to stand")
@@ -168,10 +169,12 @@ def served_page(file, scratch):
     """Run ``undulog view --web``; yield the process and the address once the page answers."""
     with process(
         *UNDULOG, "view", file, "--web", env={**os.environ, "TMPDIR": str(scratch)}
-    ) as one:
-        address = wait_for(lambda: _page(one.stdout.readline().strip()), "an address", alive=(one,))
-        wait_for(lambda: _answers(address.partition("?")[0]), "the page", alive=(one,))
-        yield one, address
+    ) as viewer:
+        address = wait_for(
+            lambda: _page(viewer.stdout.readline().strip()), "an address", alive=(viewer,)
+        )
+        wait_for(lambda: _answers(address.partition("?")[0]), "the page", alive=(viewer,))
+        yield viewer, address
 
 
 def _page(line):

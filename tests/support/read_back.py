@@ -14,11 +14,11 @@ def read(path):
     """Return all messages of a log in the order they were written, and the reader's warnings."""
     with RawLog(Path(path)) as log:
         topics = {key: channel.topic for key, channel in log.file.channels.items()}
-        found = [
+        messages = [
             (topics[m.channel_id], m.sequence, m.log_time_ns, m.publish_time_ns, m.data)
             for m in log.messages(topics, 0, 1 << 64)
         ]
-        return found, log.warnings
+        return messages, log.warnings
 
 
 def messages_of(path, **options):
@@ -29,13 +29,13 @@ def messages_of(path, **options):
 
 def opcodes_so_far(path):
     """The kinds of all whole records of a file that is still being written."""
-    data, at, found = path.read_bytes(), MAGIC_SIZE, []
+    data, at, kinds = path.read_bytes(), MAGIC_SIZE, []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from("<BQ", data, at)
         at += 9 + length
         if at <= len(data):
-            found.append(opcode)
-    return found
+            kinds.append(opcode)
+    return kinds
 
 
 def decoded_of(path, topics=None):
@@ -61,11 +61,11 @@ def summary_of(path):
 
 def metadata_of(path):
     """Metadata records of one file by name; records of one name are merged."""
-    found = {}
+    metadata = {}
     with path.open("rb") as stream:
         for record in make_reader(stream).iter_metadata():
-            found.setdefault(record.name, {}).update(record.metadata)
-    return found
+            metadata.setdefault(record.name, {}).update(record.metadata)
+    return metadata
 
 
 def chunks_of(path, topic):

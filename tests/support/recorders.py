@@ -44,8 +44,8 @@ def ended(running, number=None):
 def counts(path):
     """Messages of each topic, as mcap's own reader counts them."""
     with path.open("rb") as stream:
-        found = make_reader(stream, validate_crcs=True).iter_messages()
-        return Counter(channel.topic for _, channel, _ in found)
+        messages = make_reader(stream, validate_crcs=True).iter_messages()
+        return Counter(channel.topic for _, channel, _ in messages)
 
 
 def polling(cycles, start_ns=10**9):
@@ -75,11 +75,11 @@ def greet(client, listening=b"< hi >"):
 
 def sockets_of(pid):
     """Return the open sockets of a process."""
-    found = []
-    for one in Path(f"/proc/{pid}/fd").iterdir():
+    links = []
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(FileNotFoundError):  # closed since it was listed
-            found.append(os.readlink(one))  # noqa: PTH115
-    return [link for link in found if link.startswith("socket:")]
+            links.append(os.readlink(descriptor))  # noqa: PTH115
+    return [link for link in links if link.startswith("socket:")]
 
 
 def status_of(output):

@@ -17,16 +17,16 @@ FINE = 20
 
 def play(u, width):
     """Return the output of the play operator by its definition."""
-    z, found = 0.0, np.empty_like(u)
+    z, output = 0.0, np.empty_like(u)
     for k, value in enumerate(u):
         z = max(value - width / 2, min(value + width / 2, z))
-        found[k] = z
-    return found
+        output[k] = z
+    return output
 
 
 def stick(u, static, kinetic, lag_s, dt):
     """Return a first-order follower under dry friction, static and kinetic [rad of command]."""
-    z, moving, found = float(u[0]), 0, np.empty_like(u)
+    z, moving, output = float(u[0]), 0, np.empty_like(u)
     for k, value in enumerate(u):
         error = value - z
         if moving == 0 and abs(error) > static:
@@ -37,8 +37,8 @@ def stick(u, static, kinetic, lag_s, dt):
                 moving = 0
             else:
                 z += dt / lag_s * drive
-        found[k] = z
-    return found
+        output[k] = z
+    return output
 
 
 class Joint:
@@ -85,9 +85,9 @@ def found_in(joints, *, effort=None, second=None):
 
     def signals(values):
         pairs = zip(names, values or (), strict=False)
-        return {name: Signal(name, "", t_ns, one) for name, one in pairs}
+        return {name: Signal(name, "", t_ns, values) for name, values in pairs}
 
     empty = {field.name: {} for field in dataclasses.fields(Columns)}
-    known = {"names": tuple(names), "effort": signals(effort), "reference": signals(second)}
-    found = dead_bands(Columns(**empty | known), commands, responses, gait, 0)
-    return {int(name.removeprefix("joint")): one for name, one in found.items()}, gait
+    optional = {"names": tuple(names), "effort": signals(effort), "reference": signals(second)}
+    bands = dead_bands(Columns(**empty | optional), commands, responses, gait, 0)
+    return {int(name.removeprefix("joint")): band for name, band in bands.items()}, gait

@@ -147,7 +147,7 @@ def write_split(path, fills, **options):
     """Write a folder of two parts, as rosbag2 does when a file is full."""
     write_bag(path, fills[0], **options)
     second = write_bag(path.with_name(f"{path.name}_1"), fills[1], **options)
-    (part,) = (each for each in second.iterdir() if each.name != "metadata.yaml")
+    (part,) = (file for file in second.iterdir() if file.name != "metadata.yaml")
     part.rename(path / part.name)
     shutil.rmtree(second)
     stated = path / "metadata.yaml"

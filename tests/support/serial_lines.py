@@ -65,6 +65,6 @@ class Captured:
         return True
 
     def take(self):
-        found, self.written = self.written, b""
+        taken, self.written = self.written, b""
         self.is_using = False
-        return found
+        return taken

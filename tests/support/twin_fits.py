@@ -48,7 +48,9 @@ def room_for(
 
 def fitted(room, report_of, *words, source="run.mcap"):
     report = report_of("sim", "fit", room / source, "--on", f"twin:{room / 'nominal.toml'}", *words)
-    return report, {(one["name"], one["module"]): one for one in report["parameters"]}
+    return report, {
+        (parameter["name"], parameter["module"]): parameter for parameter in report["parameters"]
+    }
 
 
 def rewritten(source, target, change):
@@ -63,8 +65,8 @@ def rewritten(source, target, change):
             t_ns, rows = signals.t_ns[0], np.array(signals.values).T.copy()
             if signals is states:
                 t_ns, rows = change(t_ns, rows)
-            for one, row in zip(t_ns.tolist(), rows, strict=True):
-                channel.write(one, row)
+            for stamp, row in zip(t_ns.tolist(), rows, strict=True):
+                channel.write(stamp, row)
 
 
 def restamped(source, target, stamps, *, noise=0.0, seed=0):

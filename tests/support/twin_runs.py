@@ -35,7 +35,7 @@ def simulate(scenario, gait=None, **options):
 def sensed(scenario, gait=None):
     """Return all sensor samples of a run, also those that arrive after its end."""
     with Twin(scenario, gait) as twin:
-        return [one for sample in twin.samples() for one in sample.sensed] + twin.flush()
+        return [reading for sample in twin.samples() for reading in sample.sensed] + twin.flush()
 
 
 def energies(last, first=None):

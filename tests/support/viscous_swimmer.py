@@ -27,8 +27,8 @@ class Swimmer:
 
     def wrench(self, centres, turned, velocity, spin):
         """Return force and moment about the head that the ground exerts."""
-        own = velocity * np.exp(-1j * turned)
-        drag = self.length * (self.tangential * own.real + 1j * self.normal * own.imag)
+        local = velocity * np.exp(-1j * turned)
+        drag = self.length * (self.tangential * local.real + 1j * self.normal * local.imag)
         force = -drag * np.exp(1j * turned)
         moment = np.imag(np.conj(centres) * force) - self.turning * spin
         return np.array([force.sum().real, force.sum().imag, moment.sum()])
@@ -66,7 +66,7 @@ class Swimmer:
     def connection(self, angles):
         """Return the chassis' velocity in its own axes for each joint's rate, shape (3, m)."""
         place, heading = self.chassis(angles)
-        found = np.zeros((3, len(angles)))
+        connection_form = np.zeros((3, len(angles)))
         for k, (x, y, turn) in enumerate(self.at_head(angles).T):
             off = np.zeros(len(angles))
             off[k] = _STEP
@@ -77,8 +77,8 @@ class Swimmer:
             moved = x + 1j * y + 1j * turn * place + (after - before) / (2 * _STEP)
             moved *= np.exp(-1j * heading)
             spun = np.angle(np.exp(1j * (ahead - behind))) / (2 * _STEP)
-            found[:, k] = moved.real, moved.imag, turn + spun
-        return found
+            connection_form[:, k] = moved.real, moved.imag, turn + spun
+        return connection_form
 
     def cycle(self, shape, omega=1.0, count=32):
         """Return one cycle of a gait, from Fourier coefficients of its m angles."""

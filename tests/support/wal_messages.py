@@ -31,10 +31,10 @@ def filled(folder, count, *, segment_size=4096):
     return folder
 
 
-def check_messages(found):
+def check_messages(messages):
     """Check that every message is the one appended at its position, and that they are in order."""
-    for item in found:
+    for item in messages:
         assert tuple(item[i] for i in (1, 3, 4, 2, 5)) == message(item.position)
-    positions = [item.position for item in found]
+    positions = [item.position for item in messages]
     assert positions == sorted(set(positions))
     return positions

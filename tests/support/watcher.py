@@ -34,21 +34,21 @@ def descendants(pid):
                 continue
             if facts[0] != "Z":
                 parents[int(folder.name)] = int(facts[1])
-    found = {pid}
-    while more := {one for one, parent in parents.items() if parent in found} - found:
-        found |= more
-    return found - {pid, os.getpid()}
+    family = {pid}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    return family - {pid, os.getpid()}
 
 
 def scheduled(pids):
     """Return by thread the time on a processor and the time that it waited for one [s]."""
-    found = {}
+    times = {}
     for pid in pids:
         with contextlib.suppress(OSError):  # it has ended meanwhile, or the kernel doesn't count
             for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
                 ran, waited, _ = path.read_text().split()
-                found[path] = int(ran) * 1e-9, int(waited) * 1e-9
-    return found
+                times[path] = int(ran) * 1e-9, int(waited) * 1e-9
+    return times
 
 
 def passed(before, after):

@@ -51,18 +51,18 @@ def _handler(server):
             self.wfile.write(body)
 
         def do_GET(self):
-            wanted = self.headers.get("Range")
+            byte_range = self.headers.get("Range")
             with server.lock:
-                server.asked.append((self.path, wanted))
+                server.asked.append((self.path, byte_range))
             data = server.files.get(self.path.partition("?")[0].lstrip("/"))
             if server.refuse:
                 self.answer(403)
             elif data is None:
                 self.answer(404)
-            elif wanted is None or not server.ranges:
+            elif byte_range is None or not server.ranges:
                 self.answer(200, data, ETag=server.etag)
             else:
-                first, last = map(int, re.fullmatch(r"bytes=(\d+)-(\d+)", wanted).groups())
+                first, last = map(int, re.fullmatch(r"bytes=(\d+)-(\d+)", byte_range).groups())
                 if first >= len(data):
                     self.answer(416)
                     return

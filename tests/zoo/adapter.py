@@ -161,14 +161,20 @@ def stated(signals: Signals) -> Said:
         for fault in answer.not_following
     )
     different = (
-        *(Different(one.joint, one.quantity, one.deviation, None) for one in answer.stand_out),
+        *(
+            Different(difference.joint, difference.quantity, difference.deviation, None)
+            for difference in answer.stand_out
+        ),
         *(
             Different(change.joint, change.quantity, change.change, change.from_s)
             for change in answer.changes
         ),
-        *(Different(one.joint, "motion", one.amplitude_rad, None) for one in answer.extra),
+        *(Different(motion.joint, "motion", motion.amplitude_rad, None) for motion in answer.extra),
         *(Different(rest.joint, "rest", rest.offset_rad, None) for rest in answer.rests),
-        *(Different(one.joint, one.quantity, _beyond(one), None) for one in answer.apart),
+        *(
+            Different(difference.joint, difference.quantity, _beyond(difference), None)
+            for difference in answer.apart
+        ),
     )
     open_verdicts = (Verdict.OPEN, Verdict.NOTHING)
     not_decided = answer.undecided is not None or answer.verdict in open_verdicts

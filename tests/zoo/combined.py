@@ -62,9 +62,9 @@ def _(robot, rng, j):
 def _both(first, second):
     def plant(robot, rng, j):
         other = int((j + rng.integers(1, robot.m)) % robot.m)
-        one = FAULTS[first].plant(robot, rng, j)
+        planted = FAULTS[first].plant(robot, rng, j)
         two = FAULTS[second].plant(robot, rng, other)
-        return one[0] + two[0], Truth(one[1].joints + two[1].joints)
+        return planted[0] + two[0], Truth(planted[1].joints + two[1].joints)
 
     plant.__doc__ = "Both, at two joints."
     return plant

@@ -44,11 +44,11 @@ class Judgement:
 
 def named_in(text, names):
     """Return the joints whose names a text contains as whole words, in order."""
-    found = {}
+    starts = {}
     for name in names:
         if match := re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text):
-            found[name] = match.start()
-    return sorted(found, key=found.__getitem__)
+            starts[name] = match.start()
+    return sorted(starts, key=starts.__getitem__)
 
 
 def judge(output, statement, truth, robot):
@@ -56,7 +56,7 @@ def judge(output, statement, truth, robot):
     if statement.error:
         return Judgement((f"error: {statement.error}",))
     planted = {robot.names[joint.joint]: joint for joint in truth.joints}
-    expected = [name for name, one in planted.items() if _must_name(output, one)]
+    expected = [name for name, joint_truth in planted.items() if _must_name(output, joint_truth)]
     first = named_in(statement.text, robot.names)
     listed = [*(statement.not_following or ()), *(statement.stands_out or ())]
     listed += list(statement.changes)
@@ -74,8 +74,8 @@ def judge(output, statement, truth, robot):
     if not planted and output == "log check" and not statement.alike:
         missing.append("calls a healthy bag less than good")
     narrow = False
-    for name, one in planted.items() if statement.not_following is not None else ():
-        wrong, few = _of_joint(name, one, statement, robot, outside=output == DETECTION)
+    for name, planted_fault in planted.items() if statement.not_following is not None else ():
+        wrong, few = _of_joint(name, planted_fault, statement, robot, outside=output == DETECTION)
         missing += wrong
         narrow |= few
     return Judgement(tuple(missing), sound, narrow)

@@ -72,39 +72,41 @@ def statements(path, healthy, *, second, outputs=OUTPUTS):
     """
     options = Options(reference_topic=SECOND_TOPIC if second else None)
     try:
-        found = _analysed(path, options, outputs)
+        results = _analysed(path, options, outputs)
     except UndulogError as error:
         names = {"answer", "page", "rerun"} & set(outputs)
-        found = {name: Statement("", error=str(error)) for name in names}
+        results = {name: Statement("", error=str(error)) for name in names}
     if "log check" in outputs:
         health = check_session(path)
-        found["log check"] = Statement("\n".join(health.reasons), alike=health.verdict == "good")
+        results["log check"] = Statement("\n".join(health.reasons), alike=health.verdict == "good")
     if "compare" in outputs and healthy is not None:
-        found["compare"] = _compared(healthy, path, options)
-    return found
+        results["compare"] = _compared(healthy, path, options)
+    return results
 
 
 def _analysed(path, options, outputs):
-    found = {}
+    results = {}
     with Session.open(path) as session:
         analysis = analyse_session(session, options)
         if "answer" in outputs:
-            found["answer"] = structured(analysis.answer)
+            results["answer"] = structured(analysis.answer)
         if "page" in outputs:
             # Without signals and maps, whose drawing takes half of the time.
-            found["page"] = Statement(_plain(_heading(render(analysis))))
+            results["page"] = Statement(_plain(_heading(render(analysis))))
         if "rerun" in outputs:
             text = markdown(session, analysis, notes=(), colors="", content=EMPTY, has_cycles=False)
             shown = re.sub(r"\\(.)", r"\1", text.split("\n\n")[0])  # as Markdown shows it
-            found["rerun"] = Statement(shown)
-    return found
+            results["rerun"] = Statement(shown)
+    return results
 
 
 def structured(answer):
     """Return the statement of an answer, with its lists."""
     quantities = {}
-    for one in answer.stand_out:
-        quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
+    for difference in answer.stand_out:
+        quantities[difference.joint] = quantities.get(difference.joint, frozenset()) | {
+            difference.quantity
+        }
     undecided, alike = answer.undecided is not None, bool(answer.alike)
     named = _named(answer.not_following)
     changed = _changed(answer.changes)
@@ -136,8 +138,8 @@ def detected(log):
         for j, name in enumerate(robot.names)
     ]
     judgement = judge(motions)
-    found, changed = _named(judgement.faults), _changed(judgement.changes)
-    return Statement(" ".join(found | changed), found, changes=changed)
+    named, changed = _named(judgement.faults), _changed(judgement.changes)
+    return Statement(" ".join(named | changed), named, changes=changed)
 
 
 def _named(faults):
@@ -151,10 +153,10 @@ def _changed(changes):
 def _compared(healthy, path, options):
     try:
         with Session.open(healthy) as first, Session.open(path) as other:
-            found = compare_sessions(first, other, Choices(session=options))
+            comparison = compare_sessions(first, other, Choices(session=options))
     except UndulogError as error:
         return Statement("", error=str(error))
-    return Statement(found.answer, alike=found.verdict in {"same", "open"})
+    return Statement(comparison.answer, alike=comparison.verdict in {"same", "open"})
 
 
 def _heading(page):

@@ -22,7 +22,7 @@ def lines():
     yield "|---|---|---|---|"
     for name, read in recordings().items():
         signals = read()
-        said = stated(signals)
+        statement = stated(signals)
         fits = [
             independent_fit(*columns(signals, j), (None, None))
             for j in range(len(signals.names))
@@ -30,12 +30,15 @@ def lines():
         ]
         refuted = sum(
             independent_fit(
-                *columns(signals, signals.names.index(one.joint)), (one.since_s, one.until_s)
+                *columns(signals, signals.names.index(accusation.joint)),
+                (accusation.since_s, accusation.until_s),
             ).refutes
-            for one in said.accused
+            for accusation in statement.accused
         )
-        accused = f"{len(said.accused)}, {refuted} of them refuted" if said.accused else "none"
-        sentence = (said.sentence or said.refused).replace("|", "/")
+        accused = (
+            f"{len(statement.accused)}, {refuted} of them refuted" if statement.accused else "none"
+        )
+        sentence = (statement.sentence or statement.refused).replace("|", "/")
         yield f"| {name} | {sentence} | {accused} | {_range(fits)} |"
 
 

@@ -124,7 +124,7 @@ class Robot:
         t = self.sent_s[:, None]
         return self.bias + self.amplitude * self._wave(t, self.omega * t + self.phase)
 
-    def wanted(self, joint, at=None):
+    def asked(self, joint, at=None):
         """Command of a joint at the sampling times of ``at`` (itself if None) [rad], shape (n,)."""
         t = self.t_s[:, joint if at is None else at]
         wave = self._wave(t, self.omega * t + self.phase[joint])
@@ -272,7 +272,7 @@ class Change:
     Attributes:
         joint: The joint.
         position: Where it really is [rad], shape (n,); None: as usual.
-        wanted: Command that reached its servo [rad], shape (n,); None: as usual.
+        asked: Command that reached its servo [rad], shape (n,); None: as usual.
         power: Share of the effort that the motor gives, shape (n,).
         exact: Where its sensors add no noise, shape (n,).
         reading: From the position that its sensor would report to the one that it does.
@@ -282,7 +282,7 @@ class Change:
 
     joint: int
     position: np.ndarray | None = None
-    wanted: np.ndarray | None = None
+    asked: np.ndarray | None = None
     power: np.ndarray | float = 1.0
     exact: np.ndarray | bool = False
     reading: Callable[[np.ndarray], np.ndarray] = np.asarray
@@ -320,15 +320,15 @@ def record(robot, changes=(), seed=0):
         change = by_joint.get(j, Change(j))
         t, swing = robot.t_s[:, j], robot.swing(j)
         where = robot.moved(j) if change.position is None else change.position
-        wanted = robot.wanted(j) if change.wanted is None else change.wanted
+        asked = robot.asked(j) if change.asked is None else change.asked
         noisy = np.where(change.exact, 0.0, 1.0)
         read = where + noisy * noise[:, j]
         other = where + noisy * other_noise[:, j]
         if robot.step > 0:
-            read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
+            read, other = (np.round(reading / robot.step) * robot.step for reading in (read, other))
         rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
         scale = STIFFNESS * robot.amplitude[j] * abs(1 - robot.gain[j] * np.exp(-1j * robot.lag[j]))
-        pull = STIFFNESS * (wanted - where) * change.power
+        pull = STIFFNESS * (asked - where) * change.power
         pull = pull + EFFORT_NOISE * scale * rng.normal(size=n)
         read = change.reading(read)
         if robot.channels.velocity == "derived":

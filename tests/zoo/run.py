@@ -45,10 +45,10 @@ class Case:
 
 def robot_for(fault, seed, *, small=False):
     """Return the healthy robot into which a fault is planted; small: few joints and samples."""
-    own = seed_of(fault.name, seed)
-    rng = np.random.default_rng([own, 4])
+    own_seed = seed_of(fault.name, seed)
+    rng = np.random.default_rng([own_seed, 4])
     channels = None if fault.channels is None else fault.channels[rng.integers(len(fault.channels))]
-    return draw(own, small=small, channels=channels, joints=fault.joints)
+    return draw(own_seed, small=small, channels=channels, joints=fault.joints)
 
 
 def seed_of(name, seed):
@@ -60,9 +60,9 @@ def run_case(name, seed, *, small=False, outputs=OUTPUTS):
     """Plant a fault, write the bag, run undulog, judge the outputs."""
     fault = FAULTS[name]
     robot = robot_for(fault, seed, small=small)
-    own = seed_of(name, seed)
-    changes, truth = plant(fault, robot, own)
-    log = record(robot, changes, own)
+    own_seed = seed_of(name, seed)
+    changes, truth = plant(fault, robot, own_seed)
+    log = record(robot, changes, own_seed)
     if outputs == (DETECTION,):  # on arrays, so without a file
         by_output = {DETECTION: detected(log)}
     else:
@@ -70,9 +70,13 @@ def run_case(name, seed, *, small=False, outputs=OUTPUTS):
             bag = write_bag(log, Path(folder) / "faulty.mcap")
             healthy = None
             if "compare" in outputs:
-                healthy = write_bag(record(robot, (), own + 10**6), Path(folder) / "healthy.mcap")
+                healthy = write_bag(
+                    record(robot, (), own_seed + 10**6), Path(folder) / "healthy.mcap"
+                )
             by_output = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
-    judged = {output: judge(output, one, truth, robot) for output, one in by_output.items()}
+    judged = {
+        output: judge(output, statement, truth, robot) for output, statement in by_output.items()
+    }
     return Case(name, seed, robot, truth, by_output, judged)
 
 
@@ -102,8 +106,8 @@ def header(width, outputs=OUTPUTS):
 def line(cases, width, outputs=OUTPUTS):
     """Return the table's line of one fault: shares right, and naming a sound joint."""
     shares = [np.mean([case.judged[o].right for case in cases]) for o in outputs]
-    sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
-    narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in cases])
+    sound = np.mean([any(verdict.sound for verdict in case.judged.values()) for case in cases])
+    narrow = np.mean([any(verdict.narrow for verdict in case.judged.values()) for case in cases])
     fine = min(shares) >= RIGHT and sound <= SOUND
     row = "  ".join(f"{share:>9.0%}" for share in shares)
     verdict = "" if fine else "FAILS"
@@ -113,9 +117,12 @@ def line(cases, width, outputs=OUTPUTS):
 def failures(cases):
     """Yield the failures, case by case."""
     for case in cases:
-        for output, one in case.judged.items():
-            if one.missing or one.sound:
-                why = [*one.missing, *(f"names {name}, which is sound" for name in one.sound)]
+        for output, verdict in case.judged.items():
+            if verdict.missing or verdict.sound:
+                why = [
+                    *verdict.missing,
+                    *(f"names {name}, which is sound" for name in verdict.sound),
+                ]
                 robot, text = case.robot, case.statements[output].text[:300]
                 drawn = f"seed {case.seed} ({robot.m} joints, {robot.channels})"
                 yield f"{case.fault!r} {drawn}, {output}: {'; '.join(why)}\n    text: {text!r}"

@@ -12,9 +12,9 @@ def _(robot, rng, j):
     """The position is the mirror image of what it should be."""
     position = 2 * robot.bias[j] - robot.moved(j)
     # Turned as a whole: its servo sees what it always saw, and so does its effort.
-    wanted = robot.wanted(j) - robot.moved(j) + position
+    asked = robot.asked(j) - robot.moved(j) + position
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
-    return single(Change(j, position=position, wanted=wanted), {"inverted"}, kinds)
+    return single(Change(j, position=position, asked=asked), {"inverted"}, kinds)
 
 
 @fault("sensor inverted")
@@ -56,7 +56,7 @@ def _(robot, rng, j):
 
 def misled(robot, j, other):
     """Return a joint that carries out the command of another one."""
-    return Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
+    return Change(j, position=robot.moved(j, of=other), asked=robot.asked(other, at=j))
 
 
 @fault("stale samples")
@@ -67,7 +67,7 @@ def _(robot, rng, j):
     kinds = frozenset({"stale_sensor", "frozen_sensor", "lost_samples"})
     if not (robot.channels.effort or robot.channels.second):
         kinds |= PAUSED
-    change = Change(j, telemetry=lambda one: one[old])
+    change = Change(j, telemetry=lambda values: values[old])
     return single(change, {"stale_sensor"}, kinds, stands_out=LAG, checked=False)
 
 
@@ -107,7 +107,7 @@ def _(robot, rng, j):
     """The same; a second sensor shows it too."""
     since, step = _slip(robot, rng, j)
     kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped")
-    change = Change(j, position=robot.moved(j) + step, wanted=robot.wanted(j) + step)
+    change = Change(j, position=robot.moved(j) + step, asked=robot.asked(j) + step)
     return _slipped(change, "slipped", kinds, since)
 
 

@@ -54,8 +54,8 @@ def _(robot, rng, j):
     position = hold(robot.moved(j), acts)
     # The integral part of the loop has run to its limit: constant, whatever the command does.
     pull = rng.choice([-1, 1]) * robot.amplitude[j] * rng.uniform(2.0, 6.0)
-    wanted = np.where(acts, position + pull, robot.wanted(j))
-    change = Change(j, position=position, wanted=wanted, exact=acts & (rng.random() < 0.5))
+    asked = np.where(acts, position + pull, robot.asked(j))
+    change = Change(j, position=position, asked=asked, exact=acts & (rng.random() < 0.5))
     return single(change, {"stalled"}, LOADED, since_s=since)
 
 
@@ -110,7 +110,7 @@ def _(robot, rng, j):
     # A constant effort is what a stall shows; a second sensor, of another make, goes on.
     kinds = robot.channels.unless_second(*STOPPED)
     kinds |= {"frozen_sensor", "stale_sensor", "lost_samples"}
-    change = Change(j, telemetry=lambda one: hold(one, acts))
+    change = Change(j, telemetry=lambda values: hold(values, acts))
     return single(change, {"frozen_sensor", "stale_sensor"}, kinds, since_s=since)
 
 
@@ -145,12 +145,12 @@ def _(robot, rng, j):
     long = rng.uniform(1.5, 2.5) * 2 * np.pi / robot.omega
     t = robot.t_s[:, j]
     acts = (t >= start) & (t < start + long)
-    held = hold(robot.wanted(j), acts)
+    held = hold(robot.asked(j), acts)
     # It goes to where it was last sent and stays, with the small effort that this takes.
-    rest = robot.wanted(j)[acts][0] * robot.gain[j]
+    rest = robot.asked(j)[acts][0] * robot.gain[j]
     moved = robot.moved(j)
     settles = rest + (hold(moved, acts) - rest) * np.exp(-(t - start).clip(0) / 0.1)
-    change = Change(j, position=np.where(acts, settles, moved), wanted=held)
+    change = Change(j, position=np.where(acts, settles, moved), asked=held)
     kinds = PAUSED | STOPPED
     if not (robot.channels.effort or robot.channels.second):
         kinds |= {"frozen_sensor", "stale_sensor"}

@@ -47,7 +47,7 @@ def test_half_widths_are_those_of_the_noise(noise):
     basis = np.linspace(-1, 1, m)[:, None] ** np.arange(3)
     carrier = 2 / t.size * np.exp(-1j * omega * t)
     drawn = (answer_tables.noise_of(random, noise, m, t.size) for _ in range(400))
-    errors = np.array([(one @ carrier / response).real for one in drawn])
+    errors = np.array([(sample @ carrier / response).real for sample in drawn])
     for joint in (0, 4):
         others = np.delete(np.arange(m), joint)
         predicted = errors[:, others] @ (basis[joint] @ np.linalg.pinv(basis[others]))

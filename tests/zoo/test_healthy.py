@@ -195,5 +195,7 @@ def test_the_twin_is_healthy():
 @pytest.mark.parametrize("seed", [8103, 8203])
 def test_edges_of_steps_between_samples_are_no_motion_of_a_joint(seed):
     """What no response fits of them is a share of what the command moves at a frequency."""
-    said = stated(record(draw("binary", seed), seed=seed))
-    assert [one for one in said.different if one.quantity == "motion"] == []
+    statement = stated(record(draw("binary", seed), seed=seed))
+    assert [
+        difference for difference in statement.different if difference.quantity == "motion"
+    ] == []

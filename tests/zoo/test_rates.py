@@ -278,9 +278,9 @@ BY_DAY = {"so101/chirp_sweep", "so101/pick_place", "go2/traj_0", "kuka"}
     ],
 )
 def test_no_joint_of_a_sound_robot_is_accused(name):
-    said = stated(recordings()[name]())
-    assert said.accused == ()
-    assert said.doubted == ()
+    statement = stated(recordings()[name]())
+    assert statement.accused == ()
+    assert statement.doubted == ()
 
 
 @needs_recordings
@@ -315,4 +315,4 @@ def test_onsets_of_right_statements_have_a_bar_of_their_own():
     lines, is_met = table(early)
     assert "(50, 40)" in lines[1]
     assert is_met
-    assert not table([{**each, "onset": False} for each in early])[1]
+    assert not table([{**case, "onset": False} for case in early])[1]

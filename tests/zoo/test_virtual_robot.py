@@ -122,12 +122,12 @@ def healthy_on_the_bus(scenario):
 
 def problems(path, healthy, truth):
     """What is wrong with any output, a line each; where a neighbour differs it does so indeed."""
-    found = statements(path, healthy, second=False)
-    assert set(found) == set(OUTPUTS)
+    results = statements(path, healthy, second=False)
+    assert set(results) == set(OUTPUTS)
     return "\n".join(
-        f"{output}: {reason}; found: {one.text!r}"
-        for output, one in found.items()
-        for reason in judge(output, one, truth, SnakeOfTheBus).missing
+        f"{output}: {reason}; found: {statement.text!r}"
+        for output, statement in results.items()
+        for reason in judge(output, statement, truth, SnakeOfTheBus).missing
     )
 
 

@@ -45,9 +45,9 @@ def test_a_fault_touches_no_joint_but_those_it_names(name):
     for seed in range(3):
         robot = robot_for(FAULTS[name], seed, small=True)
         changes, truth = plant(FAULTS[name], robot, seed_of(name, seed))
-        healthy, faulty = (record(robot, one, 1).position for one in ((), changes))
+        healthy, faulty = (record(robot, planted, 1).position for planted in ((), changes))
         differs = ~(np.isclose(healthy, faulty, rtol=0, atol=1e-12)).all(axis=0)
-        assert np.flatnonzero(differs).tolist() == sorted(one.joint for one in truth.joints)
+        assert np.flatnonzero(differs).tolist() == sorted(joint.joint for joint in truth.joints)
         for joint in truth.joints:
             assert joint.names <= joint.allowed
             assert joint.names or joint.stands_out
@@ -78,8 +78,8 @@ def test_the_manual_lists_the_kinds_of_every_fault():
 
 def verdict(cases):
     """What fails, as the message of a failure; empty if enough is right."""
-    right = np.mean([all(one.right for one in case.judged.values()) for case in cases])
-    sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
+    right = np.mean([all(judged.right for judged in case.judged.values()) for case in cases])
+    sound = np.mean([any(judged.sound for judged in case.judged.values()) for case in cases])
     print(f"fault zoo, seed {SEED}: {right:.0%} right, {sound:.0%} name a sound joint")
     if right >= RIGHT and sound <= SOUND:
         return ""

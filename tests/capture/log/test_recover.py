@@ -200,7 +200,7 @@ def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp
     early = {path.name: path.read_bytes() for path in sorted(folder.glob("0*.seg"))[:1]}
     for number in range(1000, 8000):
         recorder.write(sink, number)
-    wait_for(lambda: not (folder / next(iter(early))).exists(), "a release", each=sink.tick)
+    wait_for(lambda: not (folder / next(iter(early))).exists(), "a release", meanwhile=sink.tick)
     copy = tmp_path / "copy"
     (copy / folder.name).mkdir(parents=True)
     for name, data in early.items():

@@ -31,7 +31,7 @@ class Stage:
         self.bus = BusRecorder("b", self.writer, SourceClock(), None, directions=False, **options)
         self.bus._decoder = SimpleNamespace(decode=self._decode)
         self.bus._topics = SimpleNamespace(add=self._add, forget=int, finish=list)
-        self.fails, self.each, self.count = (lambda _: False), lambda: 0, 0
+        self.fails, self.batch_size, self.count = (lambda _: False), lambda: 0, 0
         clock = SimpleNamespace(thread_time_ns=lambda: self.now_ns)
         monkeypatch.setattr(bus_recorder, "time", clock)
 
@@ -46,7 +46,7 @@ class Stage:
         return frames, FrameTally()
 
     def _add(self, frames):
-        first, self.count = self.count, self.count + self.each()
+        first, self.count = self.count, self.count + self.batch_size()
         return [Message(self, number) for number in range(first, self.count)]
 
     def give(self, count, first=0, dtype=None):
@@ -98,7 +98,7 @@ def test_nothing_is_begun_after_the_time_and_all_that_may_be_before_it(stage_of)
     rng = random.Random(3)
     stage = stage_of(costs=lambda: rng.choice([0, 1, 3, 5, 6, 7, 11, 12, 13, 30]) * MS)
     numbers = [rng.randrange(4) for _ in range(5000)]
-    stage.each, produced = iter(numbers).__next__, iter(numbers)
+    stage.batch_size, produced = iter(numbers).__next__, iter(numbers)
     bus, took_ns, size, left, waiting = stage.bus, 0, 256, 0, 0
     next_message = 0
     for _ in range(400):

@@ -16,7 +16,7 @@ class Model:
     """Maps one sample after the other; the line below the delays is the product's own."""
 
     def __init__(self):
-        self.envelope, self.own, self.resets, self.odd = Envelope(), False, 0, 0
+        self.envelope, self.own_clock, self.resets, self.odd = Envelope(), False, 0, 0
         self.last = self.floor = -(10**19)
         self.device = self.host = self.front = self.came = self.bucket_ends = 0
         self.pair, self.events, self.delays = None, [], []
@@ -41,7 +41,7 @@ class Model:
         """Device times; an impossible one is that of the last possible sample within 100 ms."""
         good = [0 <= t < END_NS for t in device]
         self.odd += good.count(False)
-        found = (self.device, self.came) if self.own else None
+        found = (self.device, self.came) if self.own_clock else None
         if found is None and True in good:
             found = (device[good.index(True)], host[good.index(True)])
         times = []
@@ -58,8 +58,8 @@ class Model:
         return self.last
 
     def map(self, run):
-        if not self.own:
-            self.own = True
+        if not self.own_clock:
+            self.own_clock = True
             self.restart(*run[0], Envelope())
         elif run[0][1] - self.host > 120 * NS and self.envelope.settled:
             self.after_silence(*run[0])
@@ -175,12 +175,12 @@ def test_each_sample_is_mapped_as_by_the_model(seed):
         found = clock.result()
         line, delays = model.envelope.line, np.array(model.delays) / NS
         counts = (found.own_clock, found.samples, found.resets, found.out_of_range)
-        assert counts == (model.own, len(delays), model.resets, model.odd)
-        known = model.own and model.envelope.settled
+        assert counts == (model.own_clock, len(delays), model.resets, model.odd)
+        known = model.own_clock and model.envelope.settled
         assert found.drift_uncertainty_ppm == (line.uncertainty * 1e6 if known else None)
         if known:
             assert found.drift_ppm == pytest.approx((1 / (1 + line.rate) - 1) * 1e6, abs=1e-9)
-        if model.own:
+        if model.own_clock:
             x = model.device - model.zero
             assert found.offset_ns == model.offset + round(line.offset_ns + line.rate * x)
         assert found.jitter_s == pytest.approx(delays.std(), rel=1e-5, abs=1e-6)

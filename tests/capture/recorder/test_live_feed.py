@@ -92,7 +92,7 @@ def received(link):
 
 
 def pump_until(feed, condition):
-    wait_for(condition, each=feed.pump)
+    wait_for(condition, meanwhile=feed.pump)
 
 
 @pytest.fixture

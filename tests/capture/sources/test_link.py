@@ -87,7 +87,7 @@ def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen
         sent += 1
         reader.poll()
 
-    wait_for(lambda: len(reader.frames) + (reader.counts.dropped or 0) == sent, each=send_one)
+    wait_for(lambda: len(reader.frames) + (reader.counts.dropped or 0) == sent, meanwhile=send_one)
     assert reader.counts.dropped
     assert reader.counts.frames == len(reader.frames)
 

@@ -42,7 +42,7 @@ def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back
     freeze(relay.process.pid)
     recorder.send(wait=False)  # all three seconds wait
     os.kill(relay.process.pid, signal.SIGCONT)
-    wait_for(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+    wait_for(lambda: recorder.feed.queued == 0, meanwhile=recorder.feed.pump)
     recorder.feed.close()
     assert relay.finish()["dropped"] == 0
     drawn = read_back(relay.output)
@@ -80,7 +80,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     first.process.kill()
     first.process.wait()
     assert recorder.send(0.5, 1.5, wait=False) > 40
-    wait_for(lambda: not recorder.feed.connected, each=recorder.feed.pump)
+    wait_for(lambda: not recorder.feed.connected, meanwhile=recorder.feed.pump)
     second = stage.relay("second.rrd")  # over the socket that the first has left
     recorder.connect()
     recorder.send(1.5)
@@ -132,7 +132,7 @@ def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
     recorder, relay = stage.recorder(), stage.relay()
     recorder.connect()
     recorder.send(0.0, 1.0)
-    wait_for(lambda: recorder.feed.counts.sent > 0, each=recorder.feed.pump)
+    wait_for(lambda: recorder.feed.counts.sent > 0, meanwhile=recorder.feed.pump)
     relay.process.send_signal(signal.SIGINT)
     assert relay.finish()["shown"] == recorder.feed.counts.sent
     assert "/joints/measured" in read_back(relay.output).entities
@@ -190,10 +190,10 @@ def test_a_silent_feed_ends_after_ten_seconds_and_goes_on_when_it_is_heard_again
             sent = recorder.feed.counts.sent
             recorder.send(start_s, stop_s, wait=False)
             now.pass_s(0.05)  # a datagram that isn't full waits for less
-            wait_for(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+            wait_for(lambda: recorder.feed.queued == 0, meanwhile=recorder.feed.pump)
             shown = relay.report.shown + recorder.feed.counts.sent - sent
             now.pass_s(late_s)
-            wait_for(lambda: relay.report.shown == shown, each=relay.step)
+            wait_for(lambda: relay.report.shown == shown, meanwhile=relay.step)
 
         relay.step()
         assert not relay.ended

@@ -32,7 +32,7 @@ def check_kept(written, lines):
         given = np.array([row[name] for _, row in written.commands])
         assert len(angle) - len(given) in {0, 1}
         assert np.abs(given - angle[: len(given)]).max() <= gate_stage.STEP / 2 * (1 + 1e-6)
-    notes = [text for _, _, text in written.said]
+    notes = [text for _, _, text in written.notes]
     assert notes[0] == "drives wave.mcap (commands) on " + notes[0].rpartition(" on ")[2]
     assert "gate: reading the pose" in notes
     assert any(text.startswith("gate: approach, ") for text in notes)

@@ -26,7 +26,7 @@ ERROR = 40  # of rcl_interfaces/msg/Log
 
 
 def errors(written):
-    return [text for _, level, text in written.said if level >= ERROR]
+    return [text for _, level, text in written.notes if level >= ERROR]
 
 
 def check_told(written, reason):
@@ -73,7 +73,7 @@ def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
         _, err, written = drive.ended()
     assert err.startswith("error: the bus was silent: no joint was received for ")
     # On a busy machine three ticks may be silent before the fault begins, and joints come again.
-    again = any("gate: a joint was received again" in text for _, _, text in written.said)
+    again = any("gate: a joint was received again" in text for _, _, text in written.notes)
     how = "then the joints were held where they were" if again else NOTHING_MORE
     assert how in err
     gate_stage.check_hold(written, "fault: ")
@@ -130,11 +130,11 @@ def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driv
             drive.signal(signal.SIGCONT, 0.4)
         drive.signal(signal.SIGINT)
         out, _, written = drive.ended()
-    left_out = [text for _, _, text in written.said if " control ticks were left out" in text]
+    left_out = [text for _, _, text in written.notes if " control ticks were left out" in text]
     assert sum("s of the gait" in text for text in left_out) >= 4
-    assert any("command held back to 4 rad/s" in text for _, _, text in written.said)
+    assert any("command held back to 4 rad/s" in text for _, _, text in written.notes)
     given = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
-    skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.said]
+    skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.notes]
     counts = [1 if found[1] == "a" else int(found[1]) for found in skipped if found]
     assert sum(counts) <= int(given[1]) >= 4 * 25
 
@@ -334,4 +334,4 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
     gate_stage.check_limits(lines)
     written = gate_stage.check_session(path, lines, lockstep=True)
     assert len(gate_stage.commands_of(lines)) == 25
-    assert [text for _, _, text in written.said if "command held back to 4 rad/s" in text]
+    assert [text for _, _, text in written.notes if "command held back to 4 rad/s" in text]

@@ -46,7 +46,7 @@ class Ways:
     names = ("a", "b")
 
     def __init__(self, count, step=0.002, fails=None):
-        self.count, self.each, self.fails = count, step, fails
+        self.count, self.rise, self.fails = count, step, fails
 
     def step(self, time_s, readings):
         del readings
@@ -54,7 +54,7 @@ class Ways:
         if self.fails is not None and tick == 5:
             raise self.fails
         mode = "walk" if tick < 8 else "turn"
-        command = np.full(self.count, self.each * tick)
+        command = np.full(self.count, self.rise * tick)
         return GaitTick(command, np.array([float(tick), 7.0]), mode, ())
 
 

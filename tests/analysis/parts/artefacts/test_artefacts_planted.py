@@ -53,7 +53,7 @@ def stalled(snake, j, i, k):
     snake.position[i:k, j] = snake.position[i, j] + snake.rng.normal(0, 1e-4, k - i)
     back = np.linspace(0, 1, 15)
     snake.position[k - 15 : k, j] += back * (free[-15:] - snake.position[k - 15 : k, j])
-    snake.position[i:k, j] = snake.told(snake.position[i:k, j])
+    snake.position[i:k, j] = snake.encoded(snake.position[i:k, j])
     snake.velocity[i:k, j] = snake.rng.normal(0, 0.01, k - i)
     snake.effort[i:k, j] = 1.45 + snake.rng.normal(0, 0.01, k - i)
 

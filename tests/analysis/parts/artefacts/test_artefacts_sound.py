@@ -22,7 +22,7 @@ def multisine(seed, steps, response):
         position[:, j] = (wave @ a).imag
         velocity[:, j] = (wave @ (1j * TONES * a)).imag
     snake.command, snake.velocity = command, velocity + snake.rng.normal(0, 0.002, velocity.shape)
-    snake.position = snake.told(position + snake.rng.normal(0, 1e-4, position.shape))
+    snake.position = snake.encoded(position + snake.rng.normal(0, 1e-4, position.shape))
     return snake
 
 
@@ -67,7 +67,7 @@ def wave(lags_deg, upside_down=()):
         snake.position[:, j] = sign * 0.35 * np.sin(phase - lag)
         snake.velocity[:, j] = sign * 0.35 * OMEGA * np.cos(phase - lag)
     snake.velocity += snake.rng.normal(0, 0.002, snake.velocity.shape)
-    snake.position = snake.told(snake.position + snake.rng.normal(0, 1e-4, snake.position.shape))
+    snake.position = snake.encoded(snake.position + snake.rng.normal(0, 1e-4, snake.position.shape))
     return snake
 
 

@@ -161,7 +161,7 @@ def test_what_somebody_deletes_is_written_to_a_rescue_file(harm, tmp_path):
     for number in range(500):
         recorder.write(sink, number)
     if harm == "after":
-        wait_for(lambda: not sink.backlog, "the disk's thread", each=sink.tick)
+        wait_for(lambda: not sink.backlog, "the disk's thread", meanwhile=sink.tick)
     (place / "run.mcap.part").unlink() if harm == "file" else shutil.rmtree(place)
     for number in range(500, 1000):
         recorder.write(sink, number)
@@ -189,7 +189,7 @@ def test_a_read_only_disk_is_left_for_a_rescue_file(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "write", read_only)
     for number in range(2000):
         recorder.write(sink, number)
-    wait_for(lambda: sink.must_end, "the rescue", each=sink.tick)
+    wait_for(lambda: sink.must_end, "the rescue", meanwhile=sink.tick)
     assert "Read-only file system" in sink.must_end
     sink.close(())
     assert rows_of(sink.rescued[0]) == recorder.truth(2000)
