@@ -151,11 +151,11 @@ def analysis(snake25):
     """An analysis with made-up but distinct numbers a joint."""
     joints, lags = [], {"horizontal": -math.pi / 3}
     for i, joint in enumerate(snake25.joints):
-        one = replace(passive_joint(joint.name, str(joint.plane)), energy_net_j=0.01 * i - 0.02)
+        result = replace(passive_joint(joint.name, str(joint.plane)), energy_net_j=0.01 * i - 0.02)
         if joint.plane is Plane.HORIZONTAL:
             gain, lag = around(0.95 + 0.004 * i, 0.01), around(math.radians(7.0 + 0.3 * i), 0.02)
-            one = replace(one, command_amplitude_rad=0.4, gain=gain, lag_rad=lag)
-        joints.append(one)
+            result = replace(result, command_amplitude_rad=0.4, gain=gain, lag_rad=lag)
+        joints.append(result)
     return Analysis(
         session=SessionFacts("made-for-tests", "made.mcap", "snake25", EPOCH_NS, 3.0, "good"),
         gait=GaitFacts(around(0.5, 0.01), (Window(0.0, 2.0, 1.0),), "head-to-tail", lags),
@@ -175,7 +175,7 @@ class Recorded:
         from rerun.chunk import RrdReader
 
         self._reader = RrdReader(path)
-        stores = [one for one in self._reader.recordings() if one.recording_id == identity]
+        stores = [store for store in self._reader.recordings() if store.recording_id == identity]
         self._chunks = self._reader.stream(store=next(iter(stores), None)).to_chunks()
 
     @property
@@ -190,8 +190,10 @@ class Recorded:
 
     def statics(self, entity, component):
         """Values of a static component, a list each."""
-        own = (chunk for chunk in self._chunks if chunk.entity_path == entity and chunk.is_static)
-        batches = (chunk.to_record_batch() for chunk in own)
+        static_chunks = (
+            chunk for chunk in self._chunks if chunk.entity_path == entity and chunk.is_static
+        )
+        batches = (chunk.to_record_batch() for chunk in static_chunks)
         return [b.column(component).to_pylist()[0] for b in batches if component in b.schema.names]
 
     def static(self, entity, component):
@@ -205,8 +207,8 @@ class Recorded:
 
     def rows(self, entity, component):
         """Session time [ns] to values, in order; rows without any are left out."""
-        found = zip(self.times(entity).tolist(), self.column(entity, component), strict=True)
-        return dict(sorted((t, v) for t, v in found if v is not None))
+        pairs = zip(self.times(entity).tolist(), self.column(entity, component), strict=True)
+        return dict(sorted((t, v) for t, v in pairs if v is not None))
 
     def times(self, entity, timeline="session_time"):
         """Times of an entity's rows [ns]; rows that are not on the timeline are missing."""
@@ -281,10 +283,10 @@ def sizes(rgb):
     """Height and width of each view that isn't behind a tab."""
 
     def in_front(viewer):
-        found = []
+        shapes = []
         for name in viewer.views:
             with suppress(ConnectionError):  # behind a tab
-                found.append(rgb(viewer.picture(name)).shape[:2])
-        return found
+                shapes.append(rgb(viewer.picture(name)).shape[:2])
+        return shapes
 
     return in_front

@@ -174,17 +174,17 @@ def test_a_gif_shows_the_gait(session_file, vulkan, report_of, tmp_path):
     assert shared(now, half) < 0.6
 
 
-def shared(one, other):
+def shared(area, other):
     """Common part of two areas, 0 to 1."""
-    return (one & other).sum() / (one | other).sum()
+    return (area & other).sum() / (area | other).sum()
 
 
 @pytest.mark.nightly
 def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, command, tmp_path):
     part = ("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360")
-    found = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
+    output = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
     facts, frame = played(browser, tmp_path / "a.mp4", 1.0)
-    assert "20 frames of 640x360" in found
+    assert "20 frames of 640x360" in output
     assert facts == {"width": 640, "height": 360, "duration": 2.0}
     assert glowing(frame).sum() > 500
 

@@ -44,9 +44,9 @@ def worst(viewer, shipped, tmp_path):
         png = golden_pictures.take(viewer, stream, views[name])
         (tmp_path / f"{name}.png").write_bytes(png)  # for who looks at a failure
         with Image.open(io.BytesIO(png)) as picture:
-            found = np.asarray(picture.convert("RGB")).astype(int)
+            pixels = np.asarray(picture.convert("RGB")).astype(int)
         golden = golden_pictures.load(golden_pictures.FOLDER / f"{name}.png")
-        return golden_pictures.worst_tile(found, golden)
+        return golden_pictures.worst_tile(pixels, golden)
 
     return compare
 

@@ -67,11 +67,11 @@ def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened
     expected = {"name": "scenario.toml: servo_of.joint02.stall_torque", "a": None, "b": "0.1"}
     assert expected in changed
     differences = report["comparison"]["differences"]
-    found = {
+    named = {
         (difference["place"], difference["quantity"]): difference["difference"]
         for difference in differences
     }
-    low, high = found["joint02", "lag"]["ci95"]
+    low, high = named["joint02", "lag"]["ci95"]
     assert 0.0 < low < high  # a weak servo lags
     again(room, tmp_path / "weak.mcap", "--set", change, "--force")
     printed = capsys.readouterr().out
@@ -85,16 +85,16 @@ def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened
 def commands(room):
     """Sessions of commands alone: those of the run, and with one of them 1e-3 rad larger."""
     with Session.open(room / "run.mcap") as session:
-        found, robot = session.joints("/joint_commands"), session.robot
+        joints, robot = session.joints("/joint_commands"), session.robot
         world = session.attachments["scenario.toml"]
-    values = np.array(found.values).T
+    values = np.array(joints.values).T
     altered = values.copy()
     altered[200, 3] += 1e-3
-    facts = {"epoch_ns": int(found.t_ns[0][0]), "robot": robot}
+    facts = {"epoch_ns": int(joints.t_ns[0][0]), "robot": robot}
     facts["begin"] = lambda writer: writer.attach("scenario.toml", "application/toml", world)
     for name, rows in (("plain", values), ("altered", altered)):
-        topics = {"/joint_commands": (found.names, "rad", rows)}
-        write_topics(room / f"{name}.mcap", found.t_ns[0], topics, **facts)
+        topics = {"/joint_commands": (joints.names, "rad", rows)}
+        write_topics(room / f"{name}.mcap", joints.t_ns[0], topics, **facts)
     return room
 
 
@@ -104,12 +104,14 @@ def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_pat
     printed = capsys.readouterr().out
     assert "plain.mcap has commands and no response" in printed
     assert printed.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
-    found = compare_logs(plain, again(commands, tmp_path / "altered.mcap", source="altered.mcap"))
-    assert found.differs_s["/joint_commands"] == pytest.approx(2.0)
+    comparison = compare_logs(
+        plain, again(commands, tmp_path / "altered.mcap", source="altered.mcap")
+    )
+    assert comparison.differs_s["/joint_commands"] == pytest.approx(2.0)
     # The command acts from its tick on; states of that period arrive two ticks later.
     for topic in ("/odom", "/energy_ledger", "/joint_states"):
-        assert 2.0 < found.differs_s[topic] <= 2.05, topic
-    assert found.one_sided == ()
+        assert 2.0 < comparison.differs_s[topic] <= 2.05, topic
+    assert comparison.one_sided == ()
     run = compare_logs(commands / "run.mcap", plain)
     assert set(run.differs_s) == {"/gait/mode"}  # the commands are all that drives it
     assert run.one_sided == ("/gait",)
@@ -121,8 +123,12 @@ def test_a_message_that_only_one_has_is_a_difference(tmp_path):
             channel = writer.string("/mode")
             for k in range(count):
                 channel.write(10**18 + k * 10**9, "walk")
-    found = compare_logs(tmp_path / "one.mcap", tmp_path / "two.mcap")
-    assert (found.exact, found.differs_s, found.messages) == (False, {"/mode": 3.0}, 3)
+    comparison = compare_logs(tmp_path / "one.mcap", tmp_path / "two.mcap")
+    assert (comparison.exact, comparison.differs_s, comparison.messages) == (
+        False,
+        {"/mode": 3.0},
+        3,
+    )
 
 
 def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):

@@ -38,7 +38,10 @@ def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, r
         assert second.metadata["undulog"]["driven.session_id"] == first.session_id
         a, b = first.joints("/joint_commands"), second.joints("/joint_commands")
         np.testing.assert_array_equal(a.values, b.values)  # nothing of it had to be cut
-        since_ns = [np.array(one.t_ns) - each.start_ns for one, each in ((a, first), (b, second))]
+        since_ns = [
+            np.array(series.t_ns) - session.start_ns
+            for series, session in ((a, first), (b, second))
+        ]
         np.testing.assert_array_equal(*since_ns)
         assert second.settle_s == first.settle_s
         assert {"/gait", "/gait/mode", "/gate/wanted", "/gate/phase"} <= set(second.channels)

@@ -37,7 +37,7 @@ def session(session_file, opened):
 
 
 def names_and_reasons(layer):
-    return [(one.joint, one.why) for one in layer.named]
+    return [(named_joint.joint, named_joint.why) for named_joint in layer.named]
 
 
 @pytest.fixture
@@ -64,14 +64,16 @@ def experiment(analysis):
     tilt = FloorTilt(Headings.BALANCED, 2, nothing, None, nothing, excluded=True)
     parts = test | counts | bounds | dict.fromkeys(shares, nothing)
     reversal = Reversal(**parts, joints=(), pairs=(pair,), tilt=tilt)
-    one = dataclasses.replace(analysis, session=dataclasses.replace(analysis.session, id="reverse"))
+    reverse = dataclasses.replace(
+        analysis, session=dataclasses.replace(analysis.session, id="reverse")
+    )
     runs = (
         Run("reverse", "reverse.mcap", "tail-to-head", "reverse"),
         Run("made-for-tests", "made.mcap", "head-to-tail", "forward"),
     )
-    sides = {"answer": "joint03 is weak", "sessions": (one, analysis), "runs": runs}
-    found = {"heterogeneity": {}, "reversal": reversal, "coupling": NO_COUPLING}
-    return Experiment(**sides, **found, warnings=(), provenance=MADE)
+    sides = {"answer": "joint03 is weak", "sessions": (reverse, analysis), "runs": runs}
+    differences = {"heterogeneity": {}, "reversal": reversal, "coupling": NO_COUPLING}
+    return Experiment(**sides, **differences, warnings=(), provenance=MADE)
 
 
 def test_the_numbers_shown_are_the_saved_ones(session, analysis, tmp_path):
@@ -134,7 +136,7 @@ def test_with_a_comparison_alone_the_session_is_analysed(session, comparison, tm
     layer = saved(session, [comparison.save(tmp_path / "two.json")])
     assert layer.analysis is not None
     assert layer.analysis.session.id == "made-for-tests"
-    assert [one.joint for one in layer.named] == ["joint05"]
+    assert [named_joint.joint for named_joint in layer.named] == ["joint05"]
 
 
 def test_results_that_do_not_fit_the_session_are_refused(session, analysis, experiment, tmp_path):

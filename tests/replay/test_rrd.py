@@ -55,7 +55,7 @@ def test_all_entities_are_there_by_name(recording):
 
 
 def test_what_is_drawn_follows_from_the_columns(recording, truth):
-    _, found = recording
+    _, recorded = recording
     power = truth.effort * truth.velocity
     for entity, values in {
         "/joints/measured": np.degrees(truth.position),
@@ -69,41 +69,43 @@ def test_what_is_drawn_follows_from_the_columns(recording, truth):
     }.items():
         is_angle = entity.startswith("/joints") and "places" not in entity
         component = "Angle:degrees" if is_angle else "Scalars:scalars"
-        assert_drawn(rows(found.column(entity, component)), values)
-        np.testing.assert_array_equal(found.times(entity), truth.t_ns - START)
+        assert_drawn(rows(recorded.column(entity, component)), values)
+        np.testing.assert_array_equal(recorded.times(entity), truth.t_ns - START)
     names = ["joint01 head", "joint13 middle", "joint25 tail"]
-    assert found.static("/joints/places/measured", "SeriesLines:names") == names
-    assert found.static("/joints/places/measured", "SeriesLines:widths") == [2.0, 2.0, 2.0]
-    cycles = found.times("/joints/measured", "gait_cycle") / 1e9
+    assert recorded.static("/joints/places/measured", "SeriesLines:names") == names
+    assert recorded.static("/joints/places/measured", "SeriesLines:widths") == [2.0, 2.0, 2.0]
+    cycles = recorded.times("/joints/measured", "gait_cycle") / 1e9
     np.testing.assert_allclose(cycles, truth.phase / (2 * np.pi), atol=1e-9)
 
 
 def test_joints_are_named_and_keep_their_colours(recording, snake25):
-    _, found = recording
-    assert found.static("/joints/measured", "SeriesLines:names") == list(snake25.joint_names)
+    _, recorded = recording
+    assert recorded.static("/joints/measured", "SeriesLines:names") == list(snake25.joint_names)
     packed = joint_colors(25).astype(int) @ [1 << 24, 1 << 16, 1 << 8, 1]
-    assert found.static("/joints/measured", "SeriesLines:colors") == packed.tolist()
-    assert set(found.static("/joints/commanded", "SeriesLines:colors")) == {0x8C8C8CFF}
+    assert recorded.static("/joints/measured", "SeriesLines:colors") == packed.tolist()
+    assert set(recorded.static("/joints/commanded", "SeriesLines:colors")) == {0x8C8C8CFF}
 
 
 def test_the_body_is_drawn_at_50_hz_where_the_head_was(recording, truth, snake25):
-    _, found = recording
-    origin = rows(found.column("/world/snake/measured", "Capsules3D:translations"))
+    _, recorded = recording
+    origin = rows(recorded.column("/world/snake/measured", "Capsules3D:translations"))
     assert origin.shape == (150, 26, 3)
-    np.testing.assert_array_equal(found.times("/world/snake/measured"), (truth.t_ns - START)[::2])
-    length = found.column("/world/snake/measured", "Capsules3D:lengths")[0][0]
+    np.testing.assert_array_equal(
+        recorded.times("/world/snake/measured"), (truth.t_ns - START)[::2]
+    )
+    length = recorded.column("/world/snake/measured", "Capsules3D:lengths")[0][0]
     # The head looks along x, so its capsule starts half its length behind its centre.
     expected = truth.head[::2] - [length / 2, 0.0, 0.0]
     np.testing.assert_allclose(origin[:, 0], expected, atol=ROUNDING / 2 + 1e-9)
 
 
 def test_mode_and_events_are_as_logged(recording):
-    _, found = recording
-    assert found.column("/gait/mode", "StateChange:state") == [["walk"], ["avoid"]]
-    assert found.times("/gait/mode").tolist() == [0, 1_000_000_000]
-    assert found.column("/events", "TextLog:text") == [["drive: start"], ["drive: wall ahead"]]
-    assert found.column("/events", "TextLog:level") == [["INFO"], ["ERROR"]]
-    assert found.times("/events").tolist() == [5, 1_000_000_000]
+    _, recorded = recording
+    assert recorded.column("/gait/mode", "StateChange:state") == [["walk"], ["avoid"]]
+    assert recorded.times("/gait/mode").tolist() == [0, 1_000_000_000]
+    assert recorded.column("/events", "TextLog:text") == [["drive: start"], ["drive: wall ahead"]]
+    assert recorded.column("/events", "TextLog:level") == [["INFO"], ["ERROR"]]
+    assert recorded.times("/events").tolist() == [5, 1_000_000_000]
 
 
 def test_the_facts_begin_with_the_answer(recording, analysis):
@@ -167,50 +169,52 @@ def test_a_file_cut_short_by_a_full_disk_is_an_error(session_file, tmp_path, mon
 def test_lost_samples_stay_holes(made, truth):
     position = truth.position.copy()
     position[100:110, 6] = np.nan
-    _, found = made(position=position)
-    assert_drawn(rows(found.column("/joints/measured", "Angle:degrees")), np.degrees(position))
-    links = [len(row) for row in found.column("/world/snake/measured", "Capsules3D:translations")]
+    _, recorded = made(position=position)
+    assert_drawn(rows(recorded.column("/joints/measured", "Angle:degrees")), np.degrees(position))
+    links = [
+        len(row) for row in recorded.column("/world/snake/measured", "Capsules3D:translations")
+    ]
     assert links == [7 if 50 <= i < 55 else 26 for i in range(150)]
 
 
 def test_a_pause_is_not_bridged(made, truth):
     keep = (truth.t < 1.0) | (truth.t >= 2.0)
-    _, found = made(keep=keep)
-    measured = rows(found.column("/joints/measured", "Angle:degrees"))
+    _, recorded = made(keep=keep)
+    measured = rows(recorded.column("/joints/measured", "Angle:degrees"))
     assert measured.shape == (201, 25)
     assert np.isnan(measured[100]).all()
     assert_drawn(np.delete(measured, 100, axis=0), np.degrees(truth.position[keep]))
-    assert found.times("/joints/measured")[100] == 1_000_000_000
-    body = found.column("/world/snake/measured", "Capsules3D:translations")
+    assert recorded.times("/joints/measured")[100] == 1_000_000_000
+    body = recorded.column("/world/snake/measured", "Capsules3D:translations")
     assert [i for i, row in enumerate(body) if not row] == [50]
-    trail = found.times("/world/trail")
+    trail = recorded.times("/world/trail")
     assert not ((trail > 1_000_000_000) & (trail <= 2_000_000_000)).any()
 
 
 def test_without_odometry_the_head_stays_at_the_origin(made):
-    written, found = made(odometry=False)
+    written, recorded = made(odometry=False)
     assert "no /odom in the session: the head is held at the origin" in written.warnings
-    origin = rows(found.column("/world/snake/measured", "Capsules3D:translations"))
+    origin = rows(recorded.column("/world/snake/measured", "Capsules3D:translations"))
     assert (origin[:, 0] == origin[0, 0]).all()
-    assert "/world/trail" not in found.entities
+    assert "/world/trail" not in recorded.entities
 
 
 def test_without_a_robot_and_a_gait_there_are_plots_on_one_timeline(made, truth):
-    written, found = made(robot=False, gait=False)
+    written, recorded = made(robot=False, gait=False)
     assert any("no robot description" in warning for warning in written.warnings)
-    assert not [entity for entity in found.entities if entity.startswith("/world")]
-    shown = rows(found.column("/joints/measured", "Angle:degrees"))
+    assert not [entity for entity in recorded.entities if entity.startswith("/world")]
+    shown = rows(recorded.column("/joints/measured", "Angle:degrees"))
     assert_drawn(shown, np.degrees(truth.position))
-    assert found.times("/joints/measured", "gait_cycle").size == 0
-    assert "/events" not in found.entities
+    assert recorded.times("/joints/measured", "gait_cycle").size == 0
+    assert "/events" not in recorded.entities
 
 
 def test_without_torques_the_body_wears_the_colours_of_its_joints(made):
-    written, found = made(effort=False)
+    written, recorded = made(effort=False)
     assert written.content.power_limit_w is None
     packed = joint_colors(26).astype(int) @ [1 << 24, 1 << 16, 1 << 8, 1]
-    assert found.column("/world/snake/measured", "Capsules3D:colors")[0] == packed.tolist()
-    assert "/power/mechanical" not in found.entities
+    assert recorded.column("/world/snake/measured", "Capsules3D:colors")[0] == packed.tolist()
+    assert "/power/mechanical" not in recorded.entities
 
 
 def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times(

@@ -47,8 +47,8 @@ def streaming(file, path):
         Analysing(file, TOPICS) as analysing,
     ):
 
-        def task_of(bar, known=None):
-            return progressive.Task(session, known or Layer(None), analysing, "session", bar)
+        def task_of(bar, layer=None):
+            return progressive.Task(session, layer or Layer(None), analysing, "session", bar)
 
         yield viewer, task_of
 
@@ -57,10 +57,10 @@ def streaming(file, path):
 def receive(tmp_path, read_back):
     """Streams a session to a Rerun process that writes what it takes; returns notes and file."""
 
-    def stream(file, known=None, identity=None):
+    def stream(file, layer=None, identity=None):
         path = tmp_path / "received.rrd"
         with streaming(file, path) as (viewer, task_of):
-            notes = progressive.show_session(task_of(Told(), known), viewer, StopRequest())
+            notes = progressive.show_session(task_of(Told(), layer), viewer, StopRequest())
         return notes, read_back(path, identity)
 
     return stream
@@ -78,7 +78,7 @@ def drawn(recorded):
 
 def rows_of(recorded, entity):
     """Component to its rows in the order of session time, static ones left out."""
-    found = {}
+    by_component = {}
     for batch in recorded._temporal(entity):
         if "session_time" not in batch.schema.names:
             continue
@@ -86,8 +86,8 @@ def rows_of(recorded, entity):
         for name in batch.schema.names:
             if ":" in name:
                 rows = zip(at.tolist(), batch.column(name).to_pylist(), strict=True)
-                found.setdefault(name, []).extend(rows)
-    return {name: sorted(rows, key=lambda row: row[0]) for name, rows in found.items()}
+                by_component.setdefault(name, []).extend(rows)
+    return {name: sorted(rows, key=lambda row: row[0]) for name, rows in by_component.items()}
 
 
 def same(first, second):
@@ -120,7 +120,7 @@ def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, t
     assert drawn(received) == drawn(saved)
     for entity in drawn(saved):
         # Once each, at its own time, beginning and rest joined without a seam.
-        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        ours, theirs = (np.sort(recording.times(entity)) for recording in (received, saved))
         np.testing.assert_array_equal(ours, theirs, entity)
     for entity in ("/joints/measured", "/power/mechanical", "/joints/places/commanded"):
         for component, rows in rows_of(saved, entity).items():
@@ -153,8 +153,8 @@ def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long
     names = received.static(last, "SeriesLines:names")
     assert "joint25" in names
     at_s = received.times(last) / NS
-    known = [row[names.index("joint25")] for row in received.column(last, "Scalars:scalars")]
-    assert np.count_nonzero(np.isfinite(known)) == (LONG_S - from_s) * RATE_HZ
+    values = [row[names.index("joint25")] for row in received.column(last, "Scalars:scalars")]
+    assert np.count_nonzero(np.isfinite(values)) == (LONG_S - from_s) * RATE_HZ
     assert at_s.max() == LONG_S - 1 / RATE_HZ
 
 
@@ -168,7 +168,7 @@ def test_without_odometry_the_body_is_drawn_throughout(
     saved = read_back(tmp_path / "saved.rrd")
     assert "no /odom in the session: the head is held at the origin" in notes
     for entity in ("/world/snake/measured", "/world/snake/commanded"):
-        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        ours, theirs = (np.sort(recording.times(entity)) for recording in (received, saved))
         np.testing.assert_array_equal(ours, theirs, entity)
 
 

@@ -90,10 +90,10 @@ def view(vulkan, tmp_path):
         return shown[-1]
 
     yield start
-    for one in shown:
-        if one.process.poll() is None:
-            one.process.send_signal(signal.SIGTERM)
-        one.process.communicate(timeout=WAIT_S)
+    for viewer in shown:
+        if viewer.process.poll() is None:
+            viewer.process.send_signal(signal.SIGTERM)
+        viewer.process.communicate(timeout=WAIT_S)
     assert list(scratch.iterdir()) == []
 
 
@@ -127,8 +127,8 @@ def viewer_of(shown):
     """Process id of the viewer."""
     pid = shown.process.pid
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    arguments = {int(one): Path(f"/proc/{one}/cmdline").read_bytes() for one in children}
-    return next(one for one, line in arguments.items() if b"--headless" in line)
+    arguments = {int(pid): Path(f"/proc/{pid}/cmdline").read_bytes() for pid in children}
+    return next(pid for pid, line in arguments.items() if b"--headless" in line)
 
 
 @pytest.mark.nightly
@@ -144,7 +144,7 @@ def test_the_body_comes_first_and_whoever_looks_keeps_his_place(view, long_file,
     assert until(lambda: np.abs(shown.picture(rgb, "Lag [°]") - lag).max() > 60)
     shown.client.set_time("session_time", duration=LONG_S - 5.0, play_state="paused")
     until(lambda: glows(shown.picture(rgb, body)) > 300)
-    assert [one.reports for one in shown.client.get_state().views if one.reports] == []
+    assert [panel.reports for panel in shown.client.get_state().views if panel.reports] == []
     shown.process.send_signal(signal.SIGINT)
     code, _, err = shown.finish()
     assert (code, err) == (0, "")

@@ -45,9 +45,9 @@ def make_uneven(make_robot):
             size = (0.05 + 0.01 * i, 0.02 + 1e-3 * i)
             uneven.append(Link(link.name, *size, 0.1 + 0.02 * i, inertia))
         for i, joint in enumerate(robot.joints):
-            own = {"stall_torque": 0.3 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
-            own["static_friction"] = 0.05 * (i % 3 == 0)
-            servo = dataclasses.replace(joint.servo, **own)
+            changes = {"stall_torque": 0.3 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
+            changes["static_friction"] = 0.05 * (i % 3 == 0)
+            servo = dataclasses.replace(joint.servo, **changes)
             joints.append(dataclasses.replace(joint, servo=servo))
         return dataclasses.replace(robot, links=tuple(uneven), joints=tuple(joints))
 

@@ -33,13 +33,15 @@ surface = "none"
 """
 
 
-def assert_true_or_open(found, truth):
+def assert_true_or_open(parameters, truth):
     """Within 3 % or undetermined, and in the interval."""
     for key, value in truth.items():
-        one = found[key]
-        low, high = one["ci95"]
-        assert low <= value <= high, one
-        assert not one["determined"] or one["value"] == pytest.approx(value, rel=0.03), one
+        parameter = parameters[key]
+        low, high = parameter["ci95"]
+        assert low <= value <= high, parameter
+        assert not parameter["determined"] or parameter["value"] == pytest.approx(
+            value, rel=0.03
+        ), parameter
 
 
 def assert_narrow(parameter, within=0.03):
@@ -60,15 +62,17 @@ TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03
 @pytest.mark.nightly
 def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, report_of):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
-    report, found = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
-    assert_true_or_open(found, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025})
-    assert_narrow(found["stall_torque", None])
+    report, parameters = fitted(small, report_of, *TWO, "-o", str(output), "--scenario", str(world))
+    assert_true_or_open(
+        parameters, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025}
+    )
+    assert_narrow(parameters["stall_torque", None])
     assert report["converged"]
     assert report["rms_rad"]["after"] == pytest.approx(0.001, rel=0.05)  # the encoders' noise
     assert report["rms_rad"]["before"] > report["rms_rad"]["after"]
     assert report["residual_memory_samples"] < 2.0
     servo = load_robot(output).joints[1].servo
-    assert servo.stall_torque == found["stall_torque", None]["value"]
+    assert servo.stall_torque == parameters["stall_torque", None]["value"]
     assert servo.gear_stiffness == 12.0  # what wasn't fitted stays
     assert "[defaults.servo]  # of the data sheet\n" in output.read_text()
     again = load_scenario(str(world))
@@ -83,8 +87,8 @@ def test_a_dead_time_is_reported_and_not_written(small, tmp_path, report_of):
     for name in ("robot.toml", "nominal.toml"):
         (tmp_path / name).write_text((small / name).read_text())
     words = (*TWO, "--delay", "--settle", "1.5", "-o", str(tmp_path / "fitted.toml"))
-    _, found = fitted(tmp_path, report_of, *words, source="late.mcap")
-    low, high = found["delay", None]["ci95"]
+    _, parameters = fitted(tmp_path, report_of, *words, source="late.mcap")
+    low, high = parameters["delay", None]["ci95"]
     assert low <= late_s <= high
     assert high - low < 0.004
 
@@ -143,22 +147,24 @@ mu_normal = 0.42
     room = room_for(tmp_path, 5, 8.0, hidden)
     world = tmp_path / "fitted-world.toml"
     words = ["--modules", "--within", "0.03", "--scenario", str(world)]
-    report, found = fitted(room, report_of, *words, "-o", str(tmp_path / "fitted.toml"))
+    report, parameters = fitted(room, report_of, *words, "-o", str(tmp_path / "fitted.toml"))
     assert (report["search"]["named"], report["search"]["module"]) == (True, "joint04")
     truth = {"stall_torque": 0.345, "proportional_gain": 6.8, "coulomb_friction": 0.024}
     truth |= {"viscous_friction": 0.005, "gear_stiffness": 12.0, "gear_damping": 0.008}
     truth |= {"mu_tangential": 0.06, "mu_normal": 0.42}
-    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
-    assert_true_or_open(found, {("stall_torque", "joint04"): 0.8})
+    assert_true_or_open(parameters, {(name, None): value for name, value in truth.items()})
+    assert_true_or_open(parameters, {("stall_torque", "joint04"): 0.8})
     # Short of full voltage a servo's viscous friction acts as its back EMF does.
-    ridge = next(one["factors"] for one in report["ridges"] if "stall torque" in one["factors"])
+    ridge = next(
+        ridge["factors"] for ridge in report["ridges"] if "stall torque" in ridge["factors"]
+    )
     assert "viscous friction" in ridge
     assert {"viscous friction", "gear damping"} <= set(report["undetermined"])
     again = load_scenario(str(world))
     weak, sound = again.robot.joints[3].servo, again.robot.joints[0].servo
-    factor = found["stall_torque", "joint04"]["value"]
+    factor = parameters["stall_torque", "joint04"]["value"]
     assert weak.stall_torque == pytest.approx(factor * sound.stall_torque)
-    assert again.world.ground.mu_normal == found["mu_normal", None]["value"]
+    assert again.world.ground.mu_normal == parameters["mu_normal", None]["value"]
 
 
 @pytest.mark.nightly
@@ -167,12 +173,12 @@ def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, report_of):
     hidden = "[servo]\nstall_torque = 0.345\nproportional_gain = 6.8\nviscous_friction = 0.006\n"
     room = room_for(tmp_path, 5, 8.0, hidden, gait=(0.5, 2.5))
     words = ["--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
-    report, found = fitted(room, report_of, *words)
+    report, parameters = fitted(room, report_of, *words)
     names = ("stall_torque", "proportional_gain", "viscous_friction")
     truth = dict(zip(names, (0.345, 6.8, 0.006), strict=True))
-    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
-    assert_narrow(found["stall_torque", None])
-    assert not any("stall torque" in one["factors"] for one in report["ridges"])
+    assert_true_or_open(parameters, {(name, None): value for name, value in truth.items()})
+    assert_narrow(parameters["stall_torque", None])
+    assert not any("stall torque" in ridge["factors"] for ridge in report["ridges"])
 
 
 @pytest.mark.nightly
@@ -189,12 +195,12 @@ mu_normal = 0.56
     names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
     words = [word for name in names for word in ("--only", name)]
     words += ["--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
-    report, found = fitted(room, report_of, *words)
+    report, parameters = fitted(room, report_of, *words)
     assert not report["search"]["named"]  # no module differs
     truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
-    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
-    assert_narrow(found["stall_torque", None])
-    assert_narrow(found["proportional_gain", None])
+    assert_true_or_open(parameters, {(name, None): value for name, value in truth.items()})
+    assert_narrow(parameters["stall_torque", None])
+    assert_narrow(parameters["proportional_gain", None])
 
 
 @pytest.mark.nightly
@@ -205,8 +211,8 @@ def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, report_of, command):
     command("import", TRACE, "--robot", "arcsnake-joint", "-o", tmp_path / "arc.mcap")
     (tmp_path / "nominal.toml").write_text(AIR)
     words = ("--settle", "1", "-o", str(tmp_path / "f.toml"))
-    report, found = fitted(tmp_path, report_of, *words, source="arc.mcap")
-    assert not any(one["determined"] for one in found.values())
+    report, parameters = fitted(tmp_path, report_of, *words, source="arc.mcap")
+    assert not any(parameter["determined"] for parameter in parameters.values())
     assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
     assert report["rms_rad"]["after"] < 0.002  # of a way of 17 rad; 0.0036 if held by the ticks
     assert not report["fits"]  # the twin isn't this servo
@@ -290,13 +296,13 @@ def solve_linear(columns, measured, prior):
         def at(self, _wanted, x):
             return tuple(column @ x for column in columns)
 
-        def near(self, wanted, points):
-            return (self.at(wanted, x) for x in points)
+        def near(self, unknowns, points):
+            return (self.at(unknowns, x) for x in points)
 
-    wanted = [Unknown(f"p{k}", "1", 1.0, p**-0.5) for k, p in enumerate(prior.tolist())]
-    found = solve(Model(), wanted)
-    assert found.converged
-    return found.x, found.covariance
+    unknowns = [Unknown(f"p{k}", "1", 1.0, p**-0.5) for k, p in enumerate(prior.tolist())]
+    solution = solve(Model(), unknowns)
+    assert solution.converged
+    return solution.x, solution.covariance
 
 
 def test_a_ridge_is_the_direction_that_keeps_the_outputs():
@@ -313,7 +319,7 @@ def test_a_ridge_is_the_direction_that_keeps_the_outputs():
 def test_gain_and_lateness_of_a_sine():
     t = np.arange(0.0, 4.0, 0.01)
     twin = 0.3 * np.sin(2 * np.pi * t)
-    found = misfit(t, 1.05 * 0.3 * np.sin(2 * np.pi * (t - 0.004)), twin)
-    assert found.gain == pytest.approx(0.05, abs=1e-3)
-    assert found.late_s == pytest.approx(0.004, rel=1e-2)
+    difference = misfit(t, 1.05 * 0.3 * np.sin(2 * np.pi * (t - 0.004)), twin)
+    assert difference.gain == pytest.approx(0.05, abs=1e-3)
+    assert difference.late_s == pytest.approx(0.004, rel=1e-2)
     assert misfit(t, twin, 0.0 * t).gain is None

@@ -51,9 +51,11 @@ def test_it_finds_what_comes_back_every_cycle():
     random = np.random.default_rng(2)
     for rho, loud in ((0.0, 1.0), (0.6, 2.5)):
         law = loud * 0.7 * SIGMA * np.sin(3 * OMEGA * T + 1.0)
-        found = [periodic(T, SIGMA * colored(random, rho, T.size) + law, OMEGA) for _ in range(60)]
-        assert np.mean([one.p < 0.01 for one in found]) > 0.9
-        size = np.median([one.periodic_rad for one in found])
+        results = [
+            periodic(T, SIGMA * colored(random, rho, T.size) + law, OMEGA) for _ in range(60)
+        ]
+        assert np.mean([result.p < 0.01 for result in results]) > 0.9
+        size = np.median([result.periodic_rad for result in results])
         assert size == pytest.approx(loud * 0.7 * SIGMA / math.sqrt(2), rel=0.25)
 
 
@@ -86,7 +88,7 @@ def test_without_a_gait_the_memory_is_tested():
 
 def linear(random, rho, *, apart=0.0, runs=60):
     """p of the halves' test: three joints, four parameters, which change by ``apart`` half-way."""
-    joints, found = np.arange(3.0), []
+    joints, results = np.arange(3.0), []
     for _ in range(runs):
         waves = [k * OMEGA * T[:, None] - k * joints for k in (1, 3)]
         base = np.stack([f(wave) for wave in waves for f in (np.cos, np.sin)], axis=-1)
@@ -105,20 +107,20 @@ def linear(random, rho, *, apart=0.0, runs=60):
         x = np.linalg.solve(normal, slope)
         rest = [a - c @ x for a, c in zip(angles, columns, strict=True)]
         problem = LeastSquares(columns, rest, deviations(rest), precision)
-        found.append(halves(problem, x))
-    return found
+        results.append(halves(problem, x))
+    return results
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_halves_agree_under_noise(rho):
-    p = np.array([one.p for one in linear(np.random.default_rng(5), rho)])
+    p = np.array([result.p for result in linear(np.random.default_rng(5), rho)])
     assert np.mean(p < 0.05) <= 0.05 + 3 * 0.028
 
 
 def test_halves_that_ask_for_other_parameters_are_found():
-    found = linear(np.random.default_rng(6), 0.0, apart=0.08, runs=30)
-    assert np.mean([one.p < 0.01 for one in found]) > 0.8
-    assert np.mean([one.unfitted_rad > one.fitted_rad for one in found]) == 1.0
+    results = linear(np.random.default_rng(6), 0.0, apart=0.08, runs=30)
+    assert np.mean([result.p < 0.01 for result in results]) > 0.8
+    assert np.mean([result.unfitted_rad > result.fitted_rad for result in results]) == 1.0
 
 
 def test_play_lags_by_half_its_width():
@@ -127,10 +129,12 @@ def test_play_lags_by_half_its_width():
     angle = size * np.sin(OMEGA * T)
     phase = (OMEGA * T - np.pi / 2) % np.pi
     rest = np.arccos(1 - width / size)
-    found = play_direction(angle)
+    direction = play_direction(angle)
     moving = (phase > rest) & (T > 0.25)
     behind = -0.5 * np.sign(np.cos(OMEGA * T))
-    np.testing.assert_allclose((found - found[moving].mean())[moving], behind[moving], atol=0.06)
+    np.testing.assert_allclose(
+        (direction - direction[moving].mean())[moving], behind[moving], atol=0.06
+    )
 
 
 def test_the_level_is_of_all_joints_and_checks_together():
@@ -178,9 +182,9 @@ def test_sessions_that_ask_for_other_parameters_are_found():
         truth = np.array([0.0, change, 0.0]) - change / 3
         rest = [column @ np.array([x]) + SIGMA * random.standard_normal(T.size) for x in truth]
         problem = LeastSquares([column] * 3, rest, deviations(rest), np.full(1, 4.0))
-        found = halves(problem, np.zeros(1), [0, 1, 2])
-        assert (found.p < 1e-3, found.p <= most) == (change > 0, True)
-        assert found.by_session or not change
+        result = halves(problem, np.zeros(1), [0, 1, 2])
+        assert (result.p < 1e-3, result.p <= most) == (change > 0, True)
+        assert result.by_session or not change
 
 
 def test_joints_without_enough_cycles_are_tested_for_memory():
@@ -196,8 +200,8 @@ ONLY = ("stall_torque", "coulomb_friction", "mu_tangential", "mu_normal")
 def fitted(folder, report_of, only, *, source="run.mcap", more=()):
     words = [word for name in only for word in ("--only", name)]
     words += [*more, "-o", str(folder / "f.toml")]
-    report, found = twin_fits.fitted(folder, report_of, *words, source=source)
-    return report, {name: one for (name, _), one in found.items()}
+    report, parameters = twin_fits.fitted(folder, report_of, *words, source=source)
+    return report, {name: parameter for (name, _), parameter in parameters.items()}
 
 
 @pytest.mark.nightly
@@ -205,13 +209,15 @@ def test_another_friction_law_excludes_no_truth(tmp_path, report_of):
     """The robot slips by Transeth's law, the model by the ellipse; the servo is 5 % off."""
     hidden = '[servo]\nstall_torque = 0.315\n[world.ground]\nlaw = "transeth"\n'
     twin_fits.room_for(tmp_path, 5, 8.0, hidden)
-    report, found = fitted(tmp_path, report_of, ONLY)
+    report, parameters = fitted(tmp_path, report_of, ONLY)
     for name, value in zip(ONLY, (0.315, 0.03, 0.05, 0.5), strict=True):
-        ends = found[name]["ci95"]
-        assert ends is None or ends[0] <= value <= ends[1], found[name]
+        ends = parameters[name]["ci95"]
+        assert ends is None or ends[0] <= value <= ends[1], parameters[name]
     # What the ground's law moves by a third is never called determined.
-    assert not found["mu_normal"]["determined"]
-    laws = {one["label"]: one for one in report["lack_of_fit"]["alternatives"]}
+    assert not parameters["mu_normal"]["determined"]
+    laws = {
+        alternative["label"]: alternative for alternative in report["lack_of_fit"]["alternatives"]
+    }
     low, high = laws["transeth friction"]["ci95"]
     assert 0.0 < low < 1.0 < high
 
@@ -232,13 +238,18 @@ def test_hidden_play_is_the_first_line(tmp_path, report_of):
     """Play of 0.02 rad behind one joint's encoder, as a worn gear has it."""
     twin_fits.room_for(tmp_path, 3, 6.0, "", noise=0.002)
     with_play(tmp_path / "run.mcap", tmp_path / "play.mcap", 0.02)
-    report, found = fitted(
+    report, parameters = fitted(
         tmp_path, report_of, ONLY[:2], source="play.mcap", more=("--settle", "1.5")
     )
     assert not report["fits"]
     assert report["lack_of_fit"]["worst"] == "joint02"
-    assert all(one["ci95"] is None and not one["determined"] for one in found.values())
-    play = {one["label"]: one for one in report["lack_of_fit"]["alternatives"]}["play at joint02"]
+    assert all(
+        parameter["ci95"] is None and not parameter["determined"]
+        for parameter in parameters.values()
+    )
+    play = {
+        alternative["label"]: alternative for alternative in report["lack_of_fit"]["alternatives"]
+    }["play at joint02"]
     assert play["p"] < 1e-6
     assert play["size"] == pytest.approx(0.02, rel=0.35)  # the fit took part of it
 
@@ -258,7 +269,7 @@ def with_play(source, target, width):
 @pytest.mark.nightly
 def test_the_right_law_is_left_alone(tmp_path, report_of):
     twin_fits.room_for(tmp_path, 4, 6.0, "[servo]\nstall_torque = 0.33\n")
-    report, found = fitted(tmp_path, report_of, ONLY)
+    report, parameters = fitted(tmp_path, report_of, ONLY)
     assert report["fits"]
-    assert found["stall_torque"]["ci95"][0] <= 0.33 <= found["stall_torque"]["ci95"][1]
+    assert parameters["stall_torque"]["ci95"][0] <= 0.33 <= parameters["stall_torque"]["ci95"][1]
     assert json.dumps(report, allow_nan=False)

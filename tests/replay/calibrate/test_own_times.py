@@ -31,8 +31,8 @@ def drawn(number):
 
 
 def fit(paths, room, only=tuple(FOUR)):
-    wanted = Wanted(only=only, settle_s=1.5)
-    return calibrate(paths, str(room / "nominal.toml"), wanted, kernels=Kernels.NUMBA)
+    request = Wanted(only=only, settle_s=1.5)
+    return calibrate(paths, str(room / "nominal.toml"), request, kernels=Kernels.NUMBA)
 
 
 def width(parameter):
@@ -119,10 +119,10 @@ def test_a_finer_twin_is_within_the_intervals_and_not_refused(noise, tmp_path):
     truth = drawn(1)
     room_for(tmp_path, 3, 5.0, hidden_of(truth), noise=0.0, rate_hz=5000)
     path = restamped(tmp_path / "run.mcap", tmp_path / "a.mcap", exact, noise=noise, seed=78)
-    found = fit([path], tmp_path)
-    assert not found.lack.significant
-    assert found.step.rms > 2e-4
-    for parameter in found.parameters:
+    result = fit([path], tmp_path)
+    assert not result.lack.significant
+    assert result.step.rms > 2e-4
+    for parameter in result.parameters:
         assert parameter.ci95[0] <= truth[parameter.name] <= parameter.ci95[1]
 
 
@@ -140,14 +140,14 @@ def test_intervals_cover_and_the_right_law_is_left_alone(tmp_path):
         for name, stamps in STAMPS.items():
             path = room / f"{name}.mcap"
             restamped(room / "run.mcap", path, stamps, noise=NOISE, seed=number)
-            found = fit([path], room)
-            refused.append(found.lack.significant)
-            if found.lack.significant:
+            result = fit([path], room)
+            refused.append(result.lack.significant)
+            if result.lack.significant:
                 continue
-            best = found if name == "exact" else best
-            inside[name] += [p.ci95[0] <= truth[p.name] <= p.ci95[1] for p in found.parameters]
+            best = result if name == "exact" else best
+            inside[name] += [p.ci95[0] <= truth[p.name] <= p.ci95[1] for p in result.parameters]
             if best is not None:
-                pairs = zip(found.parameters, best.parameters, strict=True)
+                pairs = zip(result.parameters, best.parameters, strict=True)
                 ratios[name] += [width(mine) / width(other) for mine, other in pairs]
     share = {name: float(np.mean(covered)) for name, covered in inside.items()}
     most = {name: float(np.max(ratio)) for name, ratio in ratios.items()}

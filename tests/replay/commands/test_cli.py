@@ -29,8 +29,8 @@ def test_save_writes_a_recording_and_reports_it(
 @pytest.mark.slow
 def test_a_session_without_a_gait_is_shown_all_the_same(write, tmp_path, command):
     session = write(tmp_path / "a.mcap", robot=False, gait=False, odometry=False)
-    found = command("view", session, "--save", tmp_path / "a.rrd").out
-    assert "no robot description" in found
+    output = command("view", session, "--save", tmp_path / "a.rrd").out
+    assert "no robot description" in output
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,8 @@ def test_power_of_the_links_is_power_of_the_joints():
 
 def test_markers_float_four_radii_over_their_joints(snake25):
     centre, rotation = link_poses(snake25, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 25)))
-    found = body.above_joints(snake25, ("joint01", "joint25"), centre, rotation)
-    np.testing.assert_allclose(found[0], [[-0.03, 0.0, 0.1], [-0.03 - 24 * 0.06, 0.0, 0.1]])
+    centres = body.above_joints(snake25, ("joint01", "joint25"), centre, rotation)
+    np.testing.assert_allclose(centres[0], [[-0.03, 0.0, 0.1], [-0.03 - 24 * 0.06, 0.0, 0.1]])
 
 
 def test_the_body_is_drawn_on_the_heads_own_times(snake25):

@@ -21,14 +21,14 @@ def tabs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tabs")
     session_file = folder / "weak.mcap"
     assert undulog.run(["sim", "run", "weak-servo-pi3", "-o", str(session_file)]) == 0
-    found = {}
+    files = {}
     with Session.open(session_file) as session:
         layer = computed(session)
         for tab in ("session", "cycles", "mean-cycle"):
-            found[tab] = folder / f"{tab}.rrd"
+            files[tab] = folder / f"{tab}.rrd"
             front = partial(build_blueprint, front=tab)
-            write_recording(session, found[tab], analysis=layer.analysis, layout=front)
-    return found
+            write_recording(session, files[tab], analysis=layer.analysis, layout=front)
+    return files
 
 
 @pytest.mark.parametrize("tab", ["session", "cycles", "mean-cycle"])

@@ -48,41 +48,41 @@ def test_harmonics_come_out_of_a_gait_that_quickens(rhythm):
     t = jittered()
     phase = chirp(t)
     track = Track("a", ns(t), 0.3 + 0.4 * np.sin(phase - 0.2) + 0.05 * np.cos(3 * phase))
-    found = mean_cycles([track], pace(rhythm))
+    means = mean_cycles([track], pace(rhythm))
     truth = 0.3 + 0.4 * np.sin(PHASE - 0.2) + 0.05 * np.cos(3 * PHASE)
-    assert found.cycles.tolist() == [14]
-    np.testing.assert_allclose(found.of("a")[0], truth, atol=2e-6)
-    assert found.of("a")[1].max() < 1e-6
+    assert means.cycles.tolist() == [14]
+    np.testing.assert_allclose(means.of("a")[0], truth, atol=2e-6)
+    assert means.of("a")[1].max() < 1e-6
 
 
 def test_what_three_harmonics_do_not_hold_is_kept(rhythm):
     t = jittered()
     flat = np.clip(0.5 * np.sin(chirp(t)), -0.3, 0.3)
-    found = mean_cycles([Track("a", ns(t), flat)], pace(rhythm))
-    np.testing.assert_allclose(found.of("a")[0], np.clip(0.5 * np.sin(PHASE), -0.3, 0.3), atol=3e-3)
+    means = mean_cycles([Track("a", ns(t), flat)], pace(rhythm))
+    np.testing.assert_allclose(means.of("a")[0], np.clip(0.5 * np.sin(PHASE), -0.3, 0.3), atol=3e-3)
 
 
 def test_the_interval_holds_the_truth_as_often_as_it_says(rhythm):
     t = jittered()
     waves = 0.4 * np.sin(chirp(t)) + 0.02 * np.random.default_rng(11).standard_normal((60, t.size))
     tracks = [Track(str(i), ns(t), wave) for i, wave in enumerate(waves)]
-    found = mean_cycles(tracks, pace(rhythm))
-    assert 0.93 < (np.abs(found.value - 0.4 * np.sin(PHASE)) <= found.half)[:, :-1].mean() < 0.97
+    means = mean_cycles(tracks, pace(rhythm))
+    assert 0.93 < (np.abs(means.value - 0.4 * np.sin(PHASE)) <= means.half)[:, :-1].mean() < 0.97
 
 
 def test_a_gap_costs_its_cycles_only(rhythm):
     t = jittered()
     kept = (t < 6.0) | (t > 6.4)
-    found = mean_cycles([Track("a", ns(t[kept]), np.sin(chirp(t[kept])))], pace(rhythm))
-    assert found.cycles.tolist() == [13]
-    np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-5)
+    means = mean_cycles([Track("a", ns(t[kept]), np.sin(chirp(t[kept])))], pace(rhythm))
+    assert means.cycles.tolist() == [13]
+    np.testing.assert_allclose(means.of("a")[0], np.sin(PHASE), atol=1e-5)
 
 
 def test_a_phase_that_runs_backwards_is_turned_round():
     t = np.arange(1001) / 100
     rhythm = LoggedRhythm.from_phase(ns(t), -2 * np.pi * 0.5 * t)
-    found = mean_cycles([Track("a", ns(t), np.sin(2 * np.pi * 0.5 * t))], pace(rhythm))
-    np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-6)
+    means = mean_cycles([Track("a", ns(t), np.sin(2 * np.pi * 0.5 * t))], pace(rhythm))
+    np.testing.assert_allclose(means.of("a")[0], np.sin(PHASE), atol=1e-6)
 
 
 @pytest.fixture
@@ -101,20 +101,20 @@ def test_the_analysed_window_is_averaged_where_there_is_a_gait(steady):
     t = np.arange(1001) / 100
     rhythm = LoggedRhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)
     swing = np.where(t < 4.0, 9.0, 1.0) * np.sin(2 * np.pi * 0.5 * t)  # a start, then the gait
-    found = mean_cycles([Track("a", ns(t), swing)], pace(rhythm, steady(4.0)))
-    assert found.cycles.tolist() == [3]
-    np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-6)
+    means = mean_cycles([Track("a", ns(t), swing)], pace(rhythm, steady(4.0)))
+    assert means.cycles.tolist() == [3]
+    np.testing.assert_allclose(means.of("a")[0], np.sin(PHASE), atol=1e-6)
 
 
 def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(steady):
     t = np.arange(1001) / 100
     wave = 2 * np.pi * 0.5 * t - 1.1
     command = Track("a", ns(t), 0.4 * np.cos(wave))
-    own = pace(None, steady(0.0), commanded=[command], places=BodyPlaces(("a",), None))
-    found = mean_cycles([command, Track("b", ns(t), 0.3 * np.cos(wave - 0.2))], own)
-    np.testing.assert_allclose(found.of("a")[0], 0.4 * np.cos(PHASE), atol=1e-6)
-    np.testing.assert_allclose(found.of("b")[0], 0.3 * np.cos(PHASE - 0.2), atol=1e-6)
-    assert not own.logged
+    pacing = pace(None, steady(0.0), commanded=[command], places=BodyPlaces(("a",), None))
+    means = mean_cycles([command, Track("b", ns(t), 0.3 * np.cos(wave - 0.2))], pacing)
+    np.testing.assert_allclose(means.of("a")[0], 0.4 * np.cos(PHASE), atol=1e-6)
+    np.testing.assert_allclose(means.of("b")[0], 0.3 * np.cos(PHASE - 0.2), atol=1e-6)
+    assert not pacing.logged
 
 
 def test_without_a_whole_cycle_there_is_none():
@@ -132,8 +132,8 @@ def test_the_frame_goes_along_with_the_body(snake25):
     assert np.linalg.eigvalsh(mean).min() > 0
     # And it is the same body: a rigid motion of what forward kinematics has.
     world, _ = link_poses(snake25, np.zeros((7, 3)), np.tile(np.eye(3), (7, 1, 1)), angles)
-    own, other = (np.linalg.norm(x[:, :, None] - x[:, None], axis=-1) for x in (centre, world))
-    np.testing.assert_allclose(own, other, atol=1e-12)
+    in_body, other = (np.linalg.norm(x[:, :, None] - x[:, None], axis=-1) for x in (centre, world))
+    np.testing.assert_allclose(in_body, other, atol=1e-12)
 
 
 def test_a_straight_body_lies_along_x_head_first(snake25):

@@ -20,13 +20,13 @@ NAMED = ["--command-topic", "/snake/targets", "--response-topic", "/snake/encode
 def bag(tmp_path_factory):
     """Five seconds of three joints, an IMU, currents, a state machine, a camera and frames."""
 
-    def write(own, t_ns, t_s):
-        phase, store = OMEGA * t_s - np.arange(3), own.bag.store
-        own.state(t_ns, t_s, "/snake/targets", 0.4 * np.sin(phase))
-        own.state(t_ns, t_s, "/snake/encoders", 0.36 * np.sin(phase - 0.2))
+    def write(log, t_ns, t_s):
+        phase, store = OMEGA * t_s - np.arange(3), log.bag.store
+        log.state(t_ns, t_s, "/snake/targets", 0.4 * np.sin(phase))
+        log.state(t_ns, t_s, "/snake/encoders", 0.36 * np.sin(phase - 0.2))
 
         def other(topic, kind, **fields):
-            own.bag.write(topic, t_ns, message(store, kind, **fields))
+            log.bag.write(topic, t_ns, message(store, kind, **fields))
 
         head = header(store, t_ns)
         still = message(store, "geometry_msgs/msg/Quaternion", w=1.0)
@@ -51,10 +51,10 @@ def bag(tmp_path_factory):
 def shown(bag, tmp_path_factory, read_back):
     """The bag as a recording, its joints named: (what was reported, what is in the file)."""
     path = tmp_path_factory.mktemp("shown") / "bag.rrd"
-    found = path.with_suffix(".txt")
-    with found.open("w") as out, redirect_stdout(out):
+    report = path.with_suffix(".txt")
+    with report.open("w") as out, redirect_stdout(out):
         assert undulog.run(["view", str(bag), *NAMED, "--save", str(path), "--json"]) == 0
-    return json.loads(found.read_text()), read_back(path)
+    return json.loads(report.read_text()), read_back(path)
 
 
 def test_the_joints_are_shown_under_the_names_that_were_given(shown):
@@ -114,5 +114,5 @@ def test_a_session_of_our_own_keeps_its_views(session_file):
     with Session.open(session_file) as session:
         assert not is_foreign(session)
         assert log_others(None, None, session, []) == ()
-        same = session.view(rename={one: one for one in ("/joint_commands", "/joint_states")})
+        same = session.view(rename={topic: topic for topic in ("/joint_commands", "/joint_states")})
         assert dict(same.channels) == dict(session.channels)

@@ -26,8 +26,8 @@ def test_head_middle_and_tail_are_of_the_busier_plane(snake25):
 
 
 def test_without_a_robot_all_joints_are_one_plane():
-    found = head_middle_tail(None, [Track(name, T, np.zeros(200)) for name in "abcde"])
-    assert (found.names, found.plane) == (("a", "c", "e"), None)
+    chosen = head_middle_tail(None, [Track(name, T, np.zeros(200)) for name in "abcde"])
+    assert (chosen.names, chosen.plane) == (("a", "c", "e"), None)
     assert head_middle_tail(None, []) is None
     single = head_middle_tail(None, [Track("servo", T, np.zeros(200))])
     assert single.names == single.labels == ("servo",)

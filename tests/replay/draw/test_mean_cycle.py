@@ -109,9 +109,9 @@ def test_the_twins_settled_motion_is_its_mean_cycle(twin):
     phase = dict(zip(gait.names, zip(gait.t_ns, gait.values, strict=True), strict=True))
     t_ns, logged = phase["horizontal.phase"]
     for k, name in enumerate(series.names):
-        own, values = joints.t_ns[k], joints.values[k]
-        last = own - start_ns > 7_000_000_000  # the last cycle, sample by sample
-        at = np.degrees(np.interp(own[last], t_ns, np.unwrap(logged))) % 360
+        sample_ns, values = joints.t_ns[k], joints.values[k]
+        last = sample_ns - start_ns > 7_000_000_000  # the last cycle, sample by sample
+        at = np.degrees(np.interp(sample_ns[last], t_ns, np.unwrap(logged))) % 360
         drawn = np.interp(at, np.arange(0, 361, 5), angles[:, k])
         assert joints.names[k] == name
         # Between 5 degrees a straight line is off by 0.4 (pi / 72)^2 / 2 rad at most.
@@ -163,15 +163,15 @@ def test_what_was_kept_stretch_by_stretch_is_what_is_read_at_once(twin, monkeypa
             Sources.of(session),
             clock_of(session),
         )
-        averaged, wanted = Averaged(clock, analysis), sources.survey.topics
-        stretches = list(timeline.stretches(session, wanted, sources.survey.context_ns))
+        averaged, fields = Averaged(clock, analysis), sources.survey.topics
+        stretches = list(timeline.stretches(session, fields, sources.survey.context_ns))
         for stretch in stretches:
             averaged.keep(stretch)
-        kept, read = averaged.kept, averaged.read(session, wanted)
+        kept, read = averaged.kept, averaged.read(session, fields)
     assert len(stretches) > 3
     assert kept.keys() == read.keys()
     for key in read:
-        for one, other in zip(kept[key], read[key], strict=True):
-            assert one.name == other.name
-            np.testing.assert_array_equal(one.t_ns, other.t_ns)
-            np.testing.assert_array_equal(one.values, other.values)
+        for track, other in zip(kept[key], read[key], strict=True):
+            assert track.name == other.name
+            np.testing.assert_array_equal(track.t_ns, other.t_ns)
+            np.testing.assert_array_equal(track.values, other.values)

@@ -30,7 +30,7 @@ NO_COST = Transport(Estimate(), None, *[Estimate()] * 5, why="")
 
 def over_time(name, gain, lag, starts=STARTS, stops=STOPS):
     """A joint's response in each cycle, without intervals."""
-    nothing, zeros, ones = ((one,) * len(starts) for one in (None, 0, 1.0))
+    nothing, zeros, ones = ((value,) * len(starts) for value in (None, 0, 1.0))
     return JointOverTime(name, starts, stops, zeros, ones, gain, nothing, lag, nothing)
 
 
@@ -84,9 +84,9 @@ def test_the_numbers_are_the_analysiss(by_cycle):
 
 
 def test_a_step_spans_its_cycle_and_ends_with_it(by_cycle, written):
-    found, recorded = written(by_cycle)
+    result, recorded = written(by_cycle)
     entity = "/cycles/gain_minus_one_percent"
-    keys = [quantity.key for quantity, _ in found.content.cycles]
+    keys = [quantity.key for quantity, _ in result.content.cycles]
     assert keys == ["gain_minus_one_percent", "lag_degrees", "energy_net_joule"]
     rows = np.array(recorded.column(entity, "Scalars:scalars"), dtype=float)
     np.testing.assert_allclose(recorded.times(entity) / 1e9, [0, 1, 2, 3])
@@ -165,8 +165,8 @@ def test_energies_of_a_cycle_stand_beside_bars_of_a_mean_cycle(by_cycle, analysi
 
 
 def test_without_cycles_there_are_no_views_of_them(analysis, written):
-    found, recorded = written(analysis)
-    assert (found.content.cycles, found.content.maps) == ((), ())
+    result, recorded = written(analysis)
+    assert (result.content.cycles, result.content.maps) == ((), ())
     assert not any(path.startswith(("/cycles", "/maps")) for path in recorded.entities)
 
 

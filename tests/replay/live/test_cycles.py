@@ -34,13 +34,13 @@ def walk(snake25, tmp_path_factory):
     offset = np.tile(np.linspace(0.0, 6e-3, 25), (900, 1))
     omega = 2 * np.pi * FREQUENCY_HZ
     size = np.where(t < 4.0, 0.4, 0.2)
-    own = omega * (t + offset[:, yaw]) - k * np.pi / 6
-    noise = np.random.default_rng(5).normal(0, 1e-4, own.shape)
+    wave = omega * (t + offset[:, yaw]) - k * np.pi / 6
+    noise = np.random.default_rng(5).normal(0, 1e-4, wave.shape)
     command, position, velocity, effort = np.zeros((4, 900, 25))
     command[:, yaw] = size * np.sin(omega * t - k * np.pi / 6)
-    position[:, yaw] = GAIN * size * np.sin(own - 0.1 - 0.02 * k) + noise
-    velocity[:, yaw] = SPEED * np.cos(own)
-    effort[:, yaw] = TORQUE * np.cos(own)
+    position[:, yaw] = GAIN * size * np.sin(wave - 0.1 - 0.02 * k) + noise
+    velocity[:, yaw] = SPEED * np.cos(wave)
+    effort[:, yaw] = TORQUE * np.cos(wave)
     phase = np.angle(np.exp(1j * omega * t))  # within a turn, as some controllers log it
     gait = np.hstack([size, np.full_like(t, omega), np.full_like(t, np.pi / 6), phase])
     parts = ["horizontal.A", "horizontal.omega", "horizontal.lag", "horizontal.phase"]
@@ -57,7 +57,7 @@ def walk(snake25, tmp_path_factory):
 
 def measured_in_batches(path, length_ns):
     """All cycles of a file that comes in pieces."""
-    log, found, meter = LiveLog(), [], None
+    log, cycles, meter = LiveLog(), [], None
     with path.open("rb") as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
@@ -72,11 +72,11 @@ def measured_in_batches(path, length_ns):
         for _, _, m in reader.iter_messages():
             meter = meter or CycleMeter(m.log_time)
             if m.log_time >= end_ns:
-                found += meter.add(log.decode(batch), log.robot)
+                cycles += meter.add(log.decode(batch), log.robot)
                 batch, end_ns = [], m.log_time + length_ns
             message = LiveMessage(m.channel_id, m.sequence, m.log_time, m.publish_time, 0, m.data)
             batch.append(message)
-    return [*found, *meter.add(log.decode(batch), log.robot)]
+    return [*cycles, *meter.add(log.decode(batch), log.robot)]
 
 
 @pytest.mark.nightly
@@ -85,10 +85,10 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
     with Session.open(walk) as session:
         joints = {joint.name: joint for joint in analyse_session(session).over_time.joints}
         start_ns = session.start_ns
-    found = measured_in_batches(walk, length_ns)
-    assert len({cycle.start_ns for cycle in found}) == len(found)  # each once
+    cycles = measured_in_batches(walk, length_ns)
+    assert len({cycle.start_ns for cycle in cycles}) == len(cycles)  # each once
     given = {}
-    for cycle in found:
+    for cycle in cycles:
         for name, gain, lag in zip(cycle.names, cycle.gain, cycle.lag_rad, strict=True):
             if np.isfinite(gain):
                 given[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
@@ -105,9 +105,9 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
 
 
 def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
-    found = measured_in_batches(walk, 50_000_000)
+    cycles = measured_in_batches(walk, 50_000_000)
     yaw = snake25.joint_indices(Plane.HORIZONTAL)
-    for cycle in found:
+    for cycle in cycles:
         assert cycle.names == snake25.joint_names
         np.testing.assert_allclose(cycle.gain[yaw], GAIN, atol=2e-3)
         np.testing.assert_allclose(cycle.lag_rad[yaw], 0.1 + 0.02 * np.arange(13), atol=2e-3)
@@ -140,8 +140,8 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
             bar = f"/segments/{key}/estimate/{snake25.joint_names[i]}"
             assert drawn.times(bar).tolist() == starts
             heights = [row[0]["buffer"] for row in drawn.column(bar, "BarChart:values")]
-            own = [of(cycle)[i] for cycle in expected]
-            np.testing.assert_allclose(np.ravel(heights).astype(float), own, atol=1e-4)
+            measured = [of(cycle)[i] for cycle in expected]
+            np.testing.assert_allclose(np.ravel(heights).astype(float), measured, atol=1e-4)
 
 
 @pytest.mark.nightly

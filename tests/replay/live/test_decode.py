@@ -40,15 +40,15 @@ def log_and_messages(tmp_path):
 def test_offsets_of_many_rounds_come_ahead_of_the_samples(log_and_messages, size):
     """A recorder writes what it decoded at once topic by topic."""
     log, messages = log_and_messages
-    found = {name: [] for name in NAMES}
+    times = {name: [] for name in NAMES}
     for start in range(0, ROUNDS, size):
         part = slice(start, start + size)
         log.decode(messages["/joint_sample_offset"][part])
         batch = log.decode(messages["/joint_states"][part])
         for track in batch.columns["/joint_states", "position"]:
-            found[track.name] += track.t_ns.tolist()
+            times[track.name] += track.t_ns.tolist()
     for k, name in enumerate(NAMES):
         expected = (
             EPOCH_NS + np.arange(ROUNDS) * 1_000_000 + np.round(OFFSET[:, k] * 1e9).astype(int)
         )
-        assert np.abs(np.array(found[name]) - expected).max() <= 1
+        assert np.abs(np.array(times[name]) - expected).max() <= 1

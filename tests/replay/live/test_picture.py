@@ -45,9 +45,9 @@ def test_angles_and_power_are_those_that_were_measured(live, truth):
         ("/power/mechanical", scalar, truth.effort * truth.velocity, 1e-8),
         ("/power/total/electrical", scalar, 6.0 * truth.effort.sum(axis=1)[:, None], 1e-6),
     ):
-        found = drawn.rows(entity, component)
-        assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
-        np.testing.assert_allclose(list(found.values()), values, atol=atol)
+        rows = drawn.rows(entity, component)
+        assert list(rows) == (truth.t_ns - EPOCH_NS).tolist()
+        np.testing.assert_allclose(list(rows.values()), values, atol=atol)
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,8 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
         if isinstance(expected[t][0], str):
             assert seen[t] == expected[t]
         else:
-            one, other = (np.array(values[t], dtype=float) for values in (seen, expected))
-            assert np.allclose(one, other, atol=atol, equal_nan=True)
+            shown, other = (np.array(values[t], dtype=float) for values in (seen, expected))
+            assert np.allclose(shown, other, atol=atol, equal_nan=True)
 
 
 def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
@@ -88,7 +88,7 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
         for component in ("SeriesLines:names", "SeriesLines:colors"):
             assert drawn.static(entity, component) == replay.static(entity, component)
     static = [chunk for chunk in drawn._chunks if chunk.entity_path == "/joints/measured"]
-    assert sum(one.is_static for one in static) == 1
+    assert sum(chunk.is_static for chunk in static) == 1
 
 
 def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back, opened):

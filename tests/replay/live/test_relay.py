@@ -28,9 +28,9 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     recorder.feed.close()
     assert relay.finish()["dropped"] == 0
     drawn = read_back(relay.output)
-    found = drawn.rows("/joints/measured", "Angle:degrees")
-    assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
-    np.testing.assert_allclose(list(found.values()), np.degrees(truth.position[150:]), atol=2e-6)
+    rows = drawn.rows("/joints/measured", "Angle:degrees")
+    assert list(rows) == (truth.t_ns - EPOCH_NS)[150:].tolist()
+    np.testing.assert_allclose(list(rows.values()), np.degrees(truth.position[150:]), atol=2e-6)
     # The mode was sent before, and still holds.
     assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
@@ -66,9 +66,9 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     report = relay.finish()
     assert report["dropped"] == recorder.feed.counts.dropped
     assert report["shown"] == recorder.feed.counts.sent
-    found = list(read_back(relay.output).rows("/joints/measured", "Angle:degrees"))
-    assert found[:50] == [10_000_000 * i for i in range(50)]
-    assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
+    times = list(read_back(relay.output).rows("/joints/measured", "Angle:degrees"))
+    assert times[:50] == [10_000_000 * i for i in range(50)]
+    assert times[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
 
 
 @pytest.mark.nightly
@@ -86,8 +86,8 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     recorder.send(1.5)
     recorder.feed.close()
     second.finish()
-    found = list(read_back(second.output).rows("/joints/measured", "Angle:degrees"))
-    assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
+    times = list(read_back(second.output).rows("/joints/measured", "Angle:degrees"))
+    assert times == [1_500_000_000 + 10_000_000 * i for i in range(150)]
 
 
 @pytest.mark.nightly
@@ -105,10 +105,10 @@ def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     relay.finish()
     drawn = read_back(relay.output)
     for j in (0, 12, 24):
-        found = drawn.rows(f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
+        rows = drawn.rows(f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
         expected = truth.t_ns - EPOCH_NS + round(offset[j] * 1e9)
-        assert np.abs(np.array(list(found)) - expected).max() <= 1
-        shown = np.ravel(list(found.values()))
+        assert np.abs(np.array(list(rows)) - expected).max() <= 1
+        shown = np.ravel(list(rows.values()))
         np.testing.assert_allclose(shown, np.degrees(truth.position[:, j]), atol=2e-6)
     centres = drawn.rows("/world/snake/measured", "Capsules3D:translations")
     assert len(centres) > 100  # at the origin, without odometry
@@ -166,15 +166,17 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
         kinds = []
 
         def end_has_come():
-            kinds[:] = [one.head.kind for one in inbox._queue]
+            kinds[:] = [batch.head.kind for batch in inbox._queue]
             return DatagramKind.END in kinds
 
         wait_for(end_has_come)
         taken = inbox.take()
-        assert sum(one.head.messages for one in taken) + inbox.dropped == recorder.feed.counts.sent
+        assert (
+            sum(batch.head.messages for batch in taken) + inbox.dropped == recorder.feed.counts.sent
+        )
         assert inbox.dropped > 0
         assert taken[0].head.kind is DatagramKind.DEFINITIONS
-        assert sum(len(one.data) for one in taken) <= 150_000
+        assert sum(len(batch.data) for batch in taken) <= 150_000
 
 
 def test_a_silent_feed_ends_after_ten_seconds_and_goes_on_when_it_is_heard_again(

@@ -126,9 +126,9 @@ def overlaid(command, tmp_path, read_back):
     return save
 
 
-def degrees(found, entity):
+def degrees(recording, entity):
     """Rows of an angle's entity [degrees]."""
-    return np.array(found.column(entity, "Angle:degrees"), dtype=float)
+    return np.array(recording.column(entity, "Angle:degrees"), dtype=float)
 
 
 ROBOT = Wave()
@@ -148,13 +148,13 @@ def files(make, tmp_path_factory):
 def beside(files, read_back, tmp_path_factory):
     """Both recordings: aligned by time and by phase."""
     folder = tmp_path_factory.mktemp("beside")
-    found = {}
+    recordings = {}
     for how in ("time", "phase"):
         path = folder / f"{how}.rrd"
         words = ["view", *map(str, files), "--names", "robot,twin", "--align", how]
         assert undulog.run([*words, "--save", str(path)]) == 0
-        found[how] = read_back(path)
-    return found
+        recordings[how] = read_back(path)
+    return recordings
 
 
 @pytest.mark.nightly
@@ -174,10 +174,12 @@ def test_every_session_keeps_its_entities_under_its_own_name(
 def test_sessions_lie_at_their_own_time_and_at_their_own_phase(beside):
     for name, wave in (("robot", ROBOT), ("twin", TWIN)):
         entity = f"/{name}/joints/measured"
-        for found in beside.values():
-            np.testing.assert_array_equal(found.times(entity), np.round(wave.t * 1e9))
+        for recording in beside.values():
+            np.testing.assert_array_equal(recording.times(entity), np.round(wave.t * 1e9))
             cycles = wave.cycles(wave.t) - math.floor(wave.phase)
-            np.testing.assert_allclose(found.times(entity, "gait_cycle") * 1e-9, cycles, atol=2e-9)
+            np.testing.assert_allclose(
+                recording.times(entity, "gait_cycle") * 1e-9, cycles, atol=2e-9
+            )
 
 
 def chord(wave, step_s):
@@ -188,41 +190,41 @@ def chord(wave, step_s):
 
 @pytest.mark.parametrize("how", ["time", "phase"])
 def test_differences_are_those_of_the_waves(beside, how):
-    found, entity, joints = beside[how], "/compared/twin/angles", np.arange(len(NAMES))
-    np.testing.assert_array_equal(found.times(entity), np.round(ROBOT.t * 1e9))
-    at = found.times(entity, "gait_cycle") * 1e-9
+    recording, entity, joints = beside[how], "/compared/twin/angles", np.arange(len(NAMES))
+    np.testing.assert_array_equal(recording.times(entity), np.round(ROBOT.t * 1e9))
+    at = recording.times(entity, "gait_cycle") * 1e-9
     np.testing.assert_allclose(at, ROBOT.cycles(ROBOT.t), atol=2e-9)
-    own = TWIN.cycles(ROBOT.t) if how == "time" else at
-    truth = np.rad2deg(TWIN.angle(joints, own[:, None]) - ROBOT.angle(joints, at[:, None]))
+    twin_cycles = TWIN.cycles(ROBOT.t) if how == "time" else at
+    truth = np.rad2deg(TWIN.angle(joints, twin_cycles[:, None]) - ROBOT.angle(joints, at[:, None]))
     common = np.full(at.size, True)
     if how == "phase":
         common = (at >= 0.3) & (at <= TWIN.cycles(TWIN.t[-1]) - 5.0)
         assert 0.7 * at.size < np.count_nonzero(common)
-    rows = degrees(found, entity)
+    rows = degrees(recording, entity)
     assert np.isnan(rows[~common]).all()
     assert np.abs(rows[common] - truth[common]).max() < chord(TWIN, 1 / TWIN.rate_hz)
-    assert found.static(entity, "SeriesLines:names") == list(NAMES)
+    assert recording.static(entity, "SeriesLines:names") == list(NAMES)
 
 
 def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     """Both go the same way in worlds of their own, so by time the heads part as one slows down."""
-    found = beside["time"]
-    x, y, z, w = found.static("/twin/world", "Transform3D:quaternion")[0]
+    recording = beside["time"]
+    x, y, z, w = recording.static("/twin/world", "Transform3D:quaternion")[0]
     turn = 2 * math.atan2(z, w)
     assert (x, y) == (0.0, 0.0)
     # In a whole cycle each body bends to either side alike, so its head's axis is its direction.
     assert abs(math.remainder(turn + TWIN.turn, 2 * math.pi)) < 1e-3
-    moved = np.array(found.static("/twin/world", "Transform3D:translation")[0])
+    moved = np.array(recording.static("/twin/world", "Transform3D:translation")[0])
     cos, sin = math.cos(turn), math.sin(turn)
     there = TWIN.head(np.zeros(1))[0]
     back = np.array([cos * there[0] - sin * there[1], sin * there[0] + cos * there[1]]) + moved[:2]
     np.testing.assert_allclose(back, ROBOT.head(np.zeros(1))[0, :2], atol=1e-6)
     assert moved[2] == 0.0
-    apart = np.array(found.column("/compared/twin/head_distance", "Scalars:scalars"))[:, 0]
+    apart = np.array(recording.column("/compared/twin/head_distance", "Scalars:scalars"))[:, 0]
     assert apart[0] < 1e-6
-    at = found.times("/compared/twin/head_distance") * 1e-9
-    own = TWIN.head(at)[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + moved[:2]
-    expected = np.linalg.norm(own - ROBOT.head(at)[:, :2], axis=1)
+    at = recording.times("/compared/twin/head_distance") * 1e-9
+    twin_head = TWIN.head(at)[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + moved[:2]
+    expected = np.linalg.norm(twin_head - ROBOT.head(at)[:, :2], axis=1)
     np.testing.assert_allclose(apart, expected, atol=1e-4)
 
 
@@ -236,16 +238,16 @@ def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path,
 
 
 def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(beside):
-    found = beside["time"]
+    recording = beside["time"]
     solid, wires = 3, 1
     for name, mode in (("robot", solid), ("twin", wires)):
-        assert [mode] in found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
-        labels = found.column(f"/{name}/world/snake/name", "Points3D:labels")
+        assert [mode] in recording.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
+        labels = recording.column(f"/{name}/world/snake/name", "Points3D:labels")
         assert {label for row in labels for label in row} == {name}
     cleared = "/robot/world/snake"
     for timeline in ("session_time", "gait_cycle"):  # at 1 Hz
-        assert found.times(cleared, timeline).tolist() == [round(ROBOT.t[-1] * 1e9) + 1]
-    assert found.times("/twin/world/snake").size == 0
+        assert recording.times(cleared, timeline).tolist() == [round(ROBOT.t[-1] * 1e9) + 1]
+    assert recording.times("/twin/world/snake").size == 0
 
 
 BAR_VALUES = "BarChart:values"
@@ -255,10 +257,10 @@ BAR_VALUES = "BarChart:values"
 def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid, opened):
     slow = Wave(amplitude=0.36, delay=0.2)
     files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
-    _, found = overlaid(*files)
+    _, recording = overlaid(*files)
 
     def bar(entity, joint):
-        ((height,),) = (one["buffer"] for one in found.static(f"{entity}/{joint}", BAR_VALUES))
+        ((height,),) = (bar["buffer"] for bar in recording.static(f"{entity}/{joint}", BAR_VALUES))
         return height
 
     comparison = compare_sessions(*map(opened, files), Choices(any_gait=True))
@@ -273,7 +275,7 @@ def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlai
         assert gain == pytest.approx(100 * noted["gain", joint].difference.value)
         assert lag == pytest.approx(math.degrees(noted["lag", joint].difference.value))
         assert abs(bar("/compared/segments/gain/b/estimate", joint) - 100 * (0.36 / 0.4 - 1)) < 0.05
-    facts = found.static("/compared/facts", "TextDocument:text")[0]
+    facts = recording.static("/compared/facts", "TextDocument:text")[0]
     said_first = facts.splitlines()[0].replace("\\", "")  # what Markdown would mark up is escaped
     assert said_first == f"**b (B) against a (A): {comparison.answer}.**"
 
@@ -303,11 +305,11 @@ def test_a_phase_is_found_where_it_was_first_reached():
     t = np.round(np.concatenate([np.arange(0, 5.005, 0.01), np.arange(6, 8.005, 0.01)]), 2)
     cycles = np.where(t < 2, t, np.where(t < 3, 2.0, t - 1.0))
     rhythm = LoggedRhythm(np.round(t * 1e9).astype(np.int64), cycles)
-    wanted = np.array([-0.1, 0.0, 0.735, 2.0, 2.5, 3.9999, 4.0, 4.5, 5.0, 6.125, 7.0, 7.01, np.nan])
-    found, known = times_of(rhythm, wanted)
+    asked = np.array([-0.1, 0.0, 0.735, 2.0, 2.5, 3.9999, 4.0, 4.5, 5.0, 6.125, 7.0, 7.01, np.nan])
+    times, reached = times_of(rhythm, asked)
     expected = [np.nan, 0.0, 0.735, 2.0, 3.5, 4.9999, 5.0, np.nan, 6.0, 7.125, 8.0, np.nan, np.nan]
-    np.testing.assert_array_equal(known, np.isfinite(expected))
-    np.testing.assert_allclose(found[known] * 1e-9, np.array(expected)[known], atol=1e-8)
+    np.testing.assert_array_equal(reached, np.isfinite(expected))
+    np.testing.assert_allclose(times[reached] * 1e-9, np.array(expected)[reached], atol=1e-8)
 
 
 @pytest.mark.nightly
@@ -315,7 +317,7 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
     bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
     for pair in ((files[0], bare), (bare, files[0])):
         report = report_of("view", *pair, "--save", tmp_path / "x.rrd", "--force")
-        bodies = {one["name"]: one["body"] for one in report["sessions"]}
+        bodies = {session["name"]: session["body"] for session in report["sessions"]}
         assert bodies == {"a": True, "bare": False}
         back = read_back(tmp_path / "x.rrd")
         assert degrees(back, f"/compared/{pair[1].stem}/angles").shape[1] == len(NAMES)
@@ -326,12 +328,12 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, o
     t_ns = EPOCH_NS + np.arange(100) * 10_000_000
     topics = {"/joint_commands": (NAMES, "rad", np.zeros((100, 5)))}
     write_topics(tmp_path / "c.mcap", t_ns, topics, robot=chain(5))
-    out, found = overlaid(tmp_path / "c.mcap", files[0])
+    out, recording = overlaid(tmp_path / "c.mcap", files[0])
     assert "note: c: no measured joint angles on /joint_states" in out
-    assert found.times("/c/joints/commanded").size == 100
-    places = {e for e in found.entities if e.startswith("/compared/places")}
+    assert recording.times("/c/joints/commanded").size == 100
+    places = {e for e in recording.entities if e.startswith("/compared/places")}
     assert places == {f"/compared/places/a/{label}" for label in ("head", "middle", "tail")}
-    assert "/compared/a/angles" not in found.entities
+    assert "/compared/a/angles" not in recording.entities
 
 
 @pytest.mark.nightly
@@ -339,19 +341,19 @@ def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
     other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
-    out, found = overlaid(long, short, other)
-    assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
-    assert "robot: chain5 → chain3" in found.static("/compared/facts", "TextDocument:text")[0]
+    out, recording = overlaid(long, short, other)
+    assert recording.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
+    assert "robot: chain5 → chain3" in recording.static("/compared/facts", "TextDocument:text")[0]
     assert "\nother (B) against long (A): not compared: no joint" in out
-    assert "/compared/other/angles" not in found.entities
+    assert "/compared/other/angles" not in recording.entities
 
 
 @pytest.mark.nightly
 def test_three_sessions_are_each_held_against_the_first(files, still, overlaid):
-    out, found = overlaid(*files, still, "--names", "robot,twin,no gait")
+    out, recording = overlaid(*files, still, "--names", "robot,twin,no gait")
     assert [line.split(" (B)")[0] for line in out.splitlines()[:2]] == ["twin", "no gait"]
-    assert {"/compared/twin/angles", "/compared/no\\ gait/angles"} <= found.entities
-    assert found.times("/no\\ gait/joints/measured", "gait_cycle").size == 0
+    assert {"/compared/twin/angles", "/compared/no\\ gait/angles"} <= recording.entities
+    assert recording.times("/no\\ gait/joints/measured", "gait_cycle").size == 0
 
 
 def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
@@ -363,10 +365,10 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     angles = np.tile(i[:, None] * 1e-3, 5)
     topics = {"/joint_states": (NAMES, "rad", angles), "/gait": (GAIT, "rad", gait)}
     late = write_topics(tmp_path / "late.mcap", EPOCH_NS + i * 10_000_000, topics, robot=chain(5))
-    _, found = overlaid(files[0], late, "--align", "gait")
-    times = found.times("/late/joints/measured")
+    _, recording = overlaid(files[0], late, "--align", "gait")
+    times = recording.times("/late/joints/measured")
     np.testing.assert_array_equal(times, (np.arange(300) - 100) * 10_000_000)
-    rows = degrees(found, "/compared/late/angles")
+    rows = degrees(recording, "/compared/late/angles")
     at = ROBOT.t[ROBOT.t < 2.0]
     truth = (0.1 + 0.1 * at)[:, None] - ROBOT.angle(np.arange(5), ROBOT.cycles(at)[:, None])
     assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
@@ -376,14 +378,14 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
 def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
-    _, found = overlaid(a, make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3))
+    _, recording = overlaid(a, make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3))
     entity, joints = "/compared/b/angles", np.arange(5)
-    at = found.times(entity) * 1e-9
-    np.testing.assert_array_equal(found.times(entity), found.times("/a/joints/measured"))
-    own, first = (one.angle(joints, one.cycles(at)[:, None]) for one in (wave, ROBOT))
-    truth = np.rad2deg(own - first)
+    at = recording.times(entity) * 1e-9
+    np.testing.assert_array_equal(recording.times(entity), recording.times("/a/joints/measured"))
+    second, first = (motion.angle(joints, motion.cycles(at)[:, None]) for motion in (wave, ROBOT))
+    truth = np.rad2deg(second - first)
     inner = slice(2, -1)  # b begins later: nothing to subtract, and no line to the next sample
-    away = np.abs(degrees(found, entity) - truth)[inner].max()
+    away = np.abs(degrees(recording, entity) - truth)[inner].max()
     assert away < chord(wave, 0.01) + chord(ROBOT, 0.01)
 
 
@@ -406,7 +408,7 @@ def test_wrong_usage_is_explained(files, tmp_path, command, words, complaint):
 @pytest.mark.nightly
 def test_files_of_one_name_are_kept_apart(files, tmp_path, report_of):
     report = report_of("view", files[0], files[0], "--save", tmp_path / "x.rrd")
-    assert [one["name"] for one in report["sessions"]] == ["a 1", "a 2"]
+    assert [session["name"] for session in report["sessions"]] == ["a 1", "a 2"]
     assert any("same content" in warning for warning in report["warnings"])
     assert report["sessions"][1]["verdict"] == "same"
 
@@ -419,8 +421,8 @@ def converted(files, tmp_path_factory):
         sessions = [stack.enter_context(Session.open(file)) for file in files]
         sides = list(map(read_side, sessions, ("robot", "twin")))
         return [
-            Converted(one, *convert(session, folder / f"{one.name}.rrd"))
-            for one, session in zip(align(sides, Align.TIME), sessions, strict=True)
+            Converted(aligned, *convert(session, folder / f"{aligned.name}.rrd"))
+            for aligned, session in zip(align(sides, Align.TIME), sessions, strict=True)
         ]
 
 
@@ -476,7 +478,7 @@ def in_a_grid(*shown):
     def views(part):
         if isinstance(part, rrb.View):
             return [part]
-        return [view for one in part.contents for view in views(one)]
+        return [view for inner in part.contents for view in views(inner)]
 
     grid = rrb.Grid(*views(build_blueprint(*shown).root_container))
     panel = rrb.TimePanel(state="collapsed", timeline=SESSION_TIME)

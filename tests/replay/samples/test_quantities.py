@@ -21,7 +21,7 @@ def track(name, values, t_ns=T):
 
 
 def rows(tracks):
-    return {one.name: (one.t_ns.tolist(), one.values.tolist()) for one in tracks}
+    return {line.name: (line.t_ns.tolist(), line.values.tolist()) for line in tracks}
 
 
 # -- what follows from samples ------------------------------------------------------------------
@@ -30,10 +30,10 @@ def rows(tracks):
 def test_an_error_is_against_the_command_that_holds():
     measured = [track("a", [1.0, 2.0, 3.0, 4.0]), track("b", [0.0] * 4)]
     commanded = [track("x", [9.0] * 4), track("a", [10.0, 20.0, 30.0, 40.0], T + 5)]
-    found = quantities.tracking_errors(measured, commanded)
-    assert [one.name for one in found] == ["a"]
-    np.testing.assert_array_equal(found[0].values, [np.nan, 2.0 - 10.0, 3.0 - 20.0, 4.0 - 30.0])
-    np.testing.assert_array_equal(found[0].t_ns, T)
+    errors = quantities.tracking_errors(measured, commanded)
+    assert [line.name for line in errors] == ["a"]
+    np.testing.assert_array_equal(errors[0].values, [np.nan, 2.0 - 10.0, 3.0 - 20.0, 4.0 - 30.0])
+    np.testing.assert_array_equal(errors[0].t_ns, T)
 
 
 def test_powers_are_products_at_the_times_of_effort_and_of_current():
@@ -73,8 +73,8 @@ def test_the_colour_is_full_at_nearly_the_largest_power(power, limit):
 
 
 def test_a_link_shows_half_of_the_joints_at_its_ends():
-    found = quantities.segment_power(np.array([[2.0, 4.0, 6.0], [1.0, 0.0, 0.0]]))
-    np.testing.assert_array_equal(found, [[1, 3, 5, 3], [0.5, 0.5, 0, 0]])
+    power = quantities.segment_power(np.array([[2.0, 4.0, 6.0], [1.0, 0.0, 0.0]]))
+    np.testing.assert_array_equal(power, [[1, 3, 5, 3], [0.5, 0.5, 0, 0]])
 
 
 def test_topics_become_paths_part_by_part():
@@ -83,29 +83,29 @@ def test_topics_become_paths_part_by_part():
 
 
 def test_what_is_plotted_of_columns():
-    one = (track("a", [1, 2, 3, 4]),)
+    lines = (track("a", [1, 2, 3, 4]),)
     columns = {
-        ("/joint_states", "position"): one,
-        ("/joint_states", "effort"): one,
-        ("/joint_states", "velocity"): one,
-        ("/joint_commands", "position"): one,
-        ("/joint_current", "position"): one,
-        ("/joint_voltage", "position"): one,
-        ("/gait", "position"): one,
-        ("/warm", "position"): one,
-        ("/warm", "velocity"): one,
-        ("/warm", "effort"): one,
+        ("/joint_states", "position"): lines,
+        ("/joint_states", "effort"): lines,
+        ("/joint_states", "velocity"): lines,
+        ("/joint_commands", "position"): lines,
+        ("/joint_current", "position"): lines,
+        ("/joint_voltage", "position"): lines,
+        ("/gait", "position"): lines,
+        ("/warm", "position"): lines,
+        ("/warm", "velocity"): lines,
+        ("/warm", "effort"): lines,
         ("/none", "position"): (),
     }
-    found = quantities.quantities(columns)
-    assert set(found) == {
+    plotted = quantities.quantities(columns)
+    assert set(plotted) == {
         "/joints/commanded", "/joints/measured", "/joints/error", "/power/mechanical",
         "/power/total/mechanical", "/power/total/electrical", "/signals/joint_current",
         "/signals/joint_voltage", "/signals/warm",
     }  # fmt: skip
-    assert rows(found["/power/total/electrical"])["total"][1] == [1, 4, 9, 16]
-    assert rows(found["/joints/error"])["a"][1] == [0, 0, 0, 0]
-    assert quantities.quantities({("/joint_states", "effort"): one}) == {}
+    assert rows(plotted["/power/total/electrical"])["total"][1] == [1, 4, 9, 16]
+    assert rows(plotted["/joints/error"])["a"][1] == [0, 0, 0, 0]
+    assert quantities.quantities({("/joint_states", "effort"): lines}) == {}
 
 
 # -- parts that are drawn together --------------------------------------------------------------
@@ -124,8 +124,8 @@ def test_parts_stay_together_only_where_they_always_are():
     assert refined([("a", "b")], [("a",)]) == [("a", "b")]  # b has no samples now
     assert refined([("a",)], [("a", "b"), ("c",)]) == [("a",), ("b",), ("c",)]
     chain = {"a": 0, "b": 1, "c": 2}
-    found = quantities._in_order([("x", "c"), ("b", "a"), ("y",)], chain)
-    assert found == (("a", "b"), ("c", "x"), ("y",))
+    parts = quantities._in_order([("x", "c"), ("b", "a"), ("y",)], chain)
+    assert parts == (("a", "b"), ("c", "x"), ("y",))
 
 
 # -- a session ----------------------------------------------------------------------------------
@@ -169,11 +169,11 @@ def test_the_fields_that_come_are_found(opened):
         "/joint_states": ["position", "velocity", "effort"], "/warm": ["position"],
         "/gait": ["position"],
     }  # fmt: skip
-    found = quantities.survey(session, 50.0)
-    assert found.topics == {"/joint_states": ["position", "velocity"], "/warm": ["position"]}
-    assert found.seen["/joint_states", "velocity"] == set(names)
-    assert found.power_limit_w is None
-    assert found.is_whole
+    survey = quantities.survey(session, 50.0)
+    assert survey.topics == {"/joint_states": ["position", "velocity"], "/warm": ["position"]}
+    assert survey.seen["/joint_states", "velocity"] == set(names)
+    assert survey.power_limit_w is None
+    assert survey.is_whole
     assert quantities.comes(session, "/joint_states", "velocity")
     assert not quantities.comes(session, "/joint_states", "effort")
     assert not quantities.comes(session, "/nothing", "position")
@@ -184,17 +184,17 @@ def test_a_survey_keeps_lines_in_chain_order_and_thins_the_times(opened, snake):
     names = ("joint03", "x", "joint01")
     fields = ("velocity", "effort")
     session = opened(("/joint_states", names, t, np.sin(t), *fields), robot=snake)
-    found = quantities.survey(session, 10.0)
-    measured = found.samples["/joints/measured"]
-    assert [one.name for one in measured] == ["joint01", "joint03", "x"]
+    survey = quantities.survey(session, 10.0)
+    measured = survey.samples["/joints/measured"]
+    assert [line.name for line in measured] == ["joint01", "joint03", "x"]
     np.testing.assert_allclose(measured[0].values, np.sin(t))
-    assert found.parts["/joints/measured"] == (("joint01", "joint03", "x"),)
+    assert survey.parts["/joints/measured"] == (("joint01", "joint03", "x"),)
     # Slots of 100 ms begin a quarter of one early, and keep their first sample.
     kept_ms = np.r_[0, 100 * np.arange(1, 41) - 20]
-    np.testing.assert_array_equal(found.drawing_ns, START + kept_ms * 1_000_000)
+    np.testing.assert_array_equal(survey.drawing_ns, START + kept_ms * 1_000_000)
     # Three lines of 25 joints have a power: the head shows half of the first one's, (1 + sin)^2.
-    assert found.power_limit_w == 2.0
-    assert found.context_ns == 500_000_000  # 1.2 x 5 steps of 10 ms are less than the least
+    assert survey.power_limit_w == 2.0
+    assert survey.context_ns == 500_000_000  # 1.2 x 5 steps of 10 ms are less than the least
     slow = opened(("/joint_states", names, t[::40], t[::40], *fields), robot=snake)
     assert quantities.survey(slow, 10.0).context_ns == pytest.approx(6 * 400_000_000)
     rare = opened(("/joint_states", names, 12.0 * t[:20] * 100, t[:20], *fields), robot=snake)
@@ -254,8 +254,8 @@ def test_stretches_are_as_long_as_they_have_to_be(opened):
     assert [span.start_ns for span in spans[1:]] == starts == [span.stop_ns for span in spans[:-1]]
     assert [span.known_ns for span in spans] == [*(at + NS for at in starts), None]
     read = timeline.stretches(session, {"/joint_states": ["position"]}, NS)
-    for k, one in enumerate(read):
-        (line,) = one.columns["/joint_states", "position"]
+    for k, stretch in enumerate(read):
+        (line,) = stretch.columns["/joint_states", "position"]
         seen = t[(t >= 40 * k - (k > 0)) & (t < 40 * (k + 1) + (k < 4))]  # a second about it
         np.testing.assert_array_equal(line.t_ns - session.start_ns, np.round(seen * NS))
     assert spans[0].start_ns < 0
@@ -311,8 +311,8 @@ def test_places_of_three_joints_are_head_middle_tail():
 def test_a_map_names_its_range():
     none = np.zeros(0)
     table = content.CycleTable(content.LAG, ("a",), none, none, none)
-    one = content.HeatMap(table, (1,), -12.5, 12.5, signed=True)
-    assert (one.entity, one.title) == ("/maps/lag_degrees", "Lag map, ±12.5°")
+    heat_map = content.HeatMap(table, (1,), -12.5, 12.5, signed=True)
+    assert (heat_map.entity, heat_map.title) == ("/maps/lag_degrees", "Lag map, ±12.5°")
     table = dataclasses.replace(table, quantity=content.ENERGY)
     other = content.HeatMap(table, (1,), 0.25, 1.5, signed=False)
     assert other.title == "Net energy map, 0.25 to 1.50 J/cycle"

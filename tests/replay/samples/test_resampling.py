@@ -41,28 +41,28 @@ def ends_here(t, i):
 
 def test_lines_between_samples_are_those_of_a_loop():
     for t, values, at in records():
-        found = tracks.interpolate(t, values, at)
-        assert found.shape == (at.size, *values.shape[1:])
-        for wanted, row in zip(at.tolist(), found, strict=True):
-            before = [i for i, one in enumerate(t.tolist()) if one <= wanted]
+        interpolated = tracks.interpolate(t, values, at)
+        assert interpolated.shape == (at.size, *values.shape[1:])
+        for instant, row in zip(at.tolist(), interpolated, strict=True):
+            before = [i for i, stamp in enumerate(t.tolist()) if stamp <= instant]
             expected = np.full(values.shape[1:], NAN)
-            if before and t[before[-1]] == wanted:
+            if before and t[before[-1]] == instant:
                 expected = values[before[-1]]
             elif before and not ends_here(t, before[-1]):
                 i = before[-1]
-                share = (wanted - t[i]) / (t[i + 1] - t[i])
+                share = (instant - t[i]) / (t[i + 1] - t[i])
                 expected = values[i] + share * (values[i + 1] - values[i])
             np.testing.assert_allclose(row, expected, atol=1e-12)
 
 
 def test_held_samples_are_those_of_a_loop():
     for t, values, at in records():
-        found = tracks.hold(t, values, at)
-        assert found.shape == (at.size, *values.shape[1:])
-        for wanted, row in zip(at.tolist(), found, strict=True):
-            before = [i for i, one in enumerate(t.tolist()) if one <= wanted]
-            known = before and wanted - t[before[-1]] <= 5 * step_of(t)
-            expected = values[before[-1]] if known else np.full(values.shape[1:], NAN)
+        held = tracks.hold(t, values, at)
+        assert held.shape == (at.size, *values.shape[1:])
+        for instant, row in zip(at.tolist(), held, strict=True):
+            before = [i for i, stamp in enumerate(t.tolist()) if stamp <= instant]
+            is_held = before and instant - t[before[-1]] <= 5 * step_of(t)
+            expected = values[before[-1]] if is_held else np.full(values.shape[1:], NAN)
             np.testing.assert_array_equal(row, expected)
 
 
@@ -76,18 +76,18 @@ def test_a_row_of_nan_ends_each_run_of_a_loop(silence):
             silent = end is not None and end - at > 5 * step_of(t)
             if silent if i + 1 == t.size else ends_here(t, i):
                 rows.append((at + step_of(t), np.full(values.shape[1:], NAN)))
-        found_t, found = tracks.mark_gaps(t, values, end)
+        found_t, marked = tracks.mark_gaps(t, values, end)
         assert found_t.tolist() == [at for at, _ in rows]
-        np.testing.assert_array_equal(found, np.reshape([row for _, row in rows], found.shape))
+        np.testing.assert_array_equal(marked, np.reshape([row for _, row in rows], marked.shape))
         if len(rows) == t.size:
             assert found_t is t
-            assert found is values
+            assert marked is values
 
 
 def test_no_samples_before_an_end_stay_none():
     t, values = times(), np.zeros((0, 2))
-    found = tracks.mark_gaps(t, values, 1000)
-    assert (found[0] is t, found[1] is values) == (True, True)
+    marked = tracks.mark_gaps(t, values, 1000)
+    assert (marked[0] is t, marked[1] is values) == (True, True)
 
 
 def test_a_step_of_a_nanosecond_may_have_gaps_too():
@@ -130,13 +130,13 @@ def test_values_are_rounded_to_the_nearest_multiple_column_by_column():
     rng = np.random.default_rng(4)
     values, steps = rng.normal(size=(60, 4)), np.array([0.25, 0.0, 2.0**-9, 1.0])
     before = values.copy()
-    found = tracks.rounded(values, steps)
+    rounded = tracks.rounded(values, steps)
     np.testing.assert_array_equal(values, before)
-    np.testing.assert_array_equal(found[:, 1], values[:, 1])
+    np.testing.assert_array_equal(rounded[:, 1], values[:, 1])
     for column in (0, 2, 3):
-        multiple = found[:, column] / steps[column]
+        multiple = rounded[:, column] / steps[column]
         np.testing.assert_array_equal(multiple, np.rint(multiple))
-        assert np.abs(found[:, column] - values[:, column]).max() <= steps[column] / 2
+        assert np.abs(rounded[:, column] - values[:, column]).max() <= steps[column] / 2
     assert tracks.rounded(values, np.zeros(4)) is values
 
 
@@ -161,8 +161,8 @@ def test_a_hundred_topics_are_drawn_the_contracts_first():
     drawn, left_out = tracks.drawn_topics(session_of(strangers | more | usual))
     assert (drawn, left_out) == (names, 2)
     assert tracks.drawn_topics(session_of(usual, "sensor_msgs/msg/Imu")) == ([], 0)
-    wanted = tracks.wanted_fields(session_of(usual))
-    assert wanted == {
+    fields = tracks.wanted_fields(session_of(usual))
+    assert fields == {
         "/joint_states": ["position", "velocity", "effort"],
         "/joint_current": ["position"],
         "/joint_commands": ["position"],
@@ -179,11 +179,11 @@ def test_a_thousand_joints_are_drawn_and_more_are_refused():
             path=SimpleNamespace(name="run.mcap"), joint_columns=lambda *_, **__: columns
         )
 
-    wanted = {"/s": ["position"]}
-    lines = tracks.read_columns(session_of_joints(1000), wanted)["/s", "position"]
+    fields = {"/s": ["position"]}
+    lines = tracks.read_columns(session_of_joints(1000), fields)["/s", "position"]
     assert [(line.name, line.t_ns.tolist()) for line in lines] == [
         (str(k), [k]) for k in range(1000)
     ]
     message = r"run\.mcap: /s has 1001 joints; at most 1000 are drawn"
     with pytest.raises(DataError, match=message):
-        tracks.read_columns(session_of_joints(1001), wanted)
+        tracks.read_columns(session_of_joints(1001), fields)

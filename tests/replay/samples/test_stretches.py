@@ -93,9 +93,9 @@ def test_stretches_leave_no_seam(session_file, tmp_path, read_back, monkeypatch)
 def test_every_sample_is_in_one_stretch(session_file, monkeypatch):
     monkeypatch.setattr(stretches, "STRETCH_NS", 1_000_000_000)
     with Session.open(session_file) as session:
-        found = survey(session, 50.0)
+        surveyed = survey(session, 50.0)
         whole = session.joints("/joint_states").t_ns
-        parts = list(stretches.stretches(session, found.topics, found.context_ns))
+        parts = list(stretches.stretches(session, surveyed.topics, surveyed.context_ns))
     assert len(parts) > 3
     for i, name in enumerate(("joint01", "joint02")):
         pieces = []
@@ -112,12 +112,12 @@ def test_a_span_is_half_open():
 
 
 def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25, opened):
-    found = survey(opened(session_file), 50.0)
-    assert found.parts["/joints/measured"] == (snake25.joint_names,)  # in turn: drawn together
-    assert [sample.name for sample in found.samples["/joints/measured"]] == list(
+    surveyed = survey(opened(session_file), 50.0)
+    assert surveyed.parts["/joints/measured"] == (snake25.joint_names,)  # in turn: drawn together
+    assert [sample.name for sample in surveyed.samples["/joints/measured"]] == list(
         snake25.joint_names
     )
-    assert found.topics["/joint_states"] == ["position", "velocity", "effort"]
-    assert "/gait" not in found.topics
-    assert found.context_ns == pytest.approx(6 * 100_000_000, rel=0.01)  # ten times a second
-    assert found.power_limit_w > 0.0
+    assert surveyed.topics["/joint_states"] == ["position", "velocity", "effort"]
+    assert "/gait" not in surveyed.topics
+    assert surveyed.context_ns == pytest.approx(6 * 100_000_000, rel=0.01)  # ten times a second
+    assert surveyed.power_limit_w > 0.0

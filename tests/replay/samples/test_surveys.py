@@ -25,14 +25,15 @@ def session(tmp_path):
         return opened[-1]
 
     yield write
-    for one in opened:
-        one.close()
+    for log in opened:
+        log.close()
 
 
-def lines(found, entity="/joints/measured"):
+def lines(surveyed, entity="/joints/measured"):
     """Line by name: its times from the start [s], and values."""
     return {
-        one.name: ((one.t_ns - EPOCH_NS) / NS, one.values) for one in found.samples.get(entity, ())
+        track.name: ((track.t_ns - EPOCH_NS) / NS, track.values)
+        for track in surveyed.samples.get(entity, ())
     }
 
 
@@ -53,12 +54,12 @@ def lines(found, entity="/joints/measured"):
 )
 def test_at_most_eight_windows_stand_for_a_session_of_320_seconds_or_more(length_ns, later_s):
     start = 12_345
-    found = quantities._looks(SimpleNamespace(start_ns=start, end_ns=start + length_ns))
+    looks = quantities._looks(SimpleNamespace(start_ns=start, end_ns=start + length_ns))
     if later_s is None:
-        assert found == []
+        assert looks == []
         return
     windows = [(0, 40), *((at, at + 2) for at in later_s)]
-    assert found == [(start + low * NS, start + high * NS) for low, high in windows]
+    assert looks == [(start + low * NS, start + high * NS) for low, high in windows]
 
 
 def test_a_brief_survey_is_as_thin_as_what_it_reads(session, monkeypatch):
@@ -67,11 +68,11 @@ def test_a_brief_survey_is_as_thin_as_what_it_reads(session, monkeypatch):
     monkeypatch.setattr(quantities, "_KEPT", 10)
     inside = np.flatnonzero((t < 40) | ((t >= 80) & (t % 80 < 2)))
     # Of 660 samples it reads 46 s of 329.5: about 92, nine times as many as are kept.
-    found = survey(long, 50.0, brief=True)
+    surveyed = survey(long, 50.0, brief=True)
     parts = [inside[inside < 80], *(np.arange(160 * k, 160 * k + 4) for k in (1, 2, 3))]
     kept = np.concatenate([t[part][::10] for part in parts])
-    np.testing.assert_allclose(lines(found)["a"][0], kept)
-    np.testing.assert_allclose(lines(found, "/signals/slow")["a"][1], -kept)
+    np.testing.assert_allclose(lines(surveyed)["a"][0], kept)
+    np.testing.assert_allclose(lines(surveyed, "/signals/slow")["a"][1], -kept)
     # All of it is thinned to as many of each stretch.
     whole = lines(survey(long, 50.0))["a"][0]
     stretches = [t[(t >= 40 * k) & (t < 40 * (k + 1) if k < 7 else t >= 280)] for k in range(8)]
@@ -84,8 +85,8 @@ def test_samples_are_left_out_from_a_multiple_of_what_is_kept_on(
 ):
     monkeypatch.setattr(quantities, "_KEPT", 40)
     t = np.arange(count) / 10
-    found = survey(session(t, {"/joint_states": (["a"], "rad", t)}), 50.0)
-    np.testing.assert_array_equal(lines(found)["a"][1], t[::apart])
+    surveyed = survey(session(t, {"/joint_states": (["a"], "rad", t)}), 50.0)
+    np.testing.assert_array_equal(lines(surveyed)["a"][1], t[::apart])
 
 
 # -- what is drawn together -----------------------------------------------------------------------
@@ -112,8 +113,10 @@ def test_joints_in_turn_are_one_part_where_a_robot_logs_when_it_sampled(session)
 def test_a_picture_is_drawn_when_the_first_joint_was_measured(session):
     t = np.arange(60) / 10
     values = np.stack([np.where(np.arange(60) % 4 == 1, 1.0, np.nan), np.ones(60)], axis=1)
-    found = survey(session(t, {"/joint_states": (["seldom", "often"], "rad", values)}), 50.0)
-    np.testing.assert_array_equal(found.drawing_ns, EPOCH_NS + np.round(t[1::4] * NS).astype(int))
+    surveyed = survey(session(t, {"/joint_states": (["seldom", "often"], "rad", values)}), 50.0)
+    np.testing.assert_array_equal(
+        surveyed.drawing_ns, EPOCH_NS + np.round(t[1::4] * NS).astype(int)
+    )
 
 
 def test_parts_of_two_surveys_are_the_classes_of_both():
@@ -127,17 +130,17 @@ def test_parts_of_two_surveys_are_the_classes_of_both():
             [tuple(n for n in part if part[n] == k) for k in dict.fromkeys(part.values())]
             for part in (before, now)
         )
-        found = refined(first, second)
-        assert sorted(name for part in found for name in part) == sorted({*before, *now})
-        where = {name: k for k, part in enumerate(found) for name in part}
-        for one in names:
+        parts = refined(first, second)
+        assert sorted(name for part in parts for name in part) == sorted({*before, *now})
+        where = {name: k for k, part in enumerate(parts) for name in part}
+        for joint in names:
             for other in names:
-                if {one, other} <= before.keys() and {one, other} <= now.keys():
-                    same = before[one] == before[other] and now[one] == now[other]
-                    assert (where[one] == where[other]) == same
-                elif one in before and other not in before and other in now:
-                    assert where[one] != where[other]
-        assert refined(found, second) == found
+                if {joint, other} <= before.keys() and {joint, other} <= now.keys():
+                    same = before[joint] == before[other] and now[joint] == now[other]
+                    assert (where[joint] == where[other]) == same
+                elif joint in before and other not in before and other in now:
+                    assert where[joint] != where[other]
+        assert refined(parts, second) == parts
 
 
 # -- power and colours ----------------------------------------------------------------------------
@@ -145,19 +148,22 @@ def test_parts_of_two_surveys_are_the_classes_of_both():
 
 def test_power_colours_only_the_links_of_a_robot(session, snake25):
     robot, t = snake25, np.arange(10) * 0.3
-    one = np.ones((10, 25))
-    effort = np.where(t < 1.5, 1.0, 7.0)[:, None] * one
-    topics = {"/joint_states": (robot.joint_names, "rad", one, 2.0 * one, effort)}
-    plain, known = survey(session(t, topics), 50.0), survey(session(t, topics, robot=robot), 50.0)
+    ones = np.ones((10, 25))
+    effort = np.where(t < 1.5, 1.0, 7.0)[:, None] * ones
+    topics = {"/joint_states": (robot.joint_names, "rad", ones, 2.0 * ones, effort)}
+    plain, with_robot = (
+        survey(session(t, topics), 50.0),
+        survey(session(t, topics, robot=robot), 50.0),
+    )
     assert {*lines(plain, "/power/mechanical")} == {*robot.joint_names}
     # A link within the body shows as much as a joint.
-    assert (plain.power_limit_w, known.power_limit_w) == (None, 14.0)
+    assert (plain.power_limit_w, with_robot.power_limit_w) == (None, 14.0)
 
 
 def test_the_times_of_a_thinned_picture_are_those_of_the_first_measured_joint(session):
     t = np.arange(1000) / 100
     names = ["a", "b"]
-    found = survey(
+    surveyed = survey(
         session(
             t,
             {
@@ -170,10 +176,12 @@ def test_the_times_of_a_thinned_picture_are_those_of_the_first_measured_joint(se
     )
     slots = np.floor((t + 0.025 + 1e-9) / 0.1)
     first = np.flatnonzero(np.diff(slots, prepend=-1))
-    np.testing.assert_array_equal(found.drawing_ns, EPOCH_NS + np.round(t[first] * NS).astype(int))
-    assert found.is_whole
-    assert [*found.seen] == [
-        ("/joint_commands", "position"), *(("/joint_states", one) for one in
+    np.testing.assert_array_equal(
+        surveyed.drawing_ns, EPOCH_NS + np.round(t[first] * NS).astype(int)
+    )
+    assert surveyed.is_whole
+    assert [*surveyed.seen] == [
+        ("/joint_commands", "position"), *(("/joint_states", field) for field in
         ("position", "velocity", "effort")), ("/other", "position"),
     ]  # fmt: skip
 
@@ -184,9 +192,9 @@ def test_the_times_of_a_thinned_picture_are_those_of_the_first_measured_joint(se
 def test_a_stretch_is_four_times_what_is_read_about_it_at_least(session):
     t = np.arange(0.0, 400.0, 2.0)
     long = session(t, {"/joint_states": (["a"], "rad", t)})
-    wanted = {"/joint_states": ["position"]}
+    fields = {"/joint_states": ["position"]}
     for context_s, length_s in ((10, 40), (10.5, 42), (25, 100)):
-        parts = list(timeline.stretches(long, wanted, round(context_s * NS)))
+        parts = list(timeline.stretches(long, fields, round(context_s * NS)))
         assert len(parts) == round(398 / length_s)
         for k, part in enumerate(parts):
             last = k + 1 == len(parts)

@@ -22,21 +22,23 @@ T = np.arange(400, dtype=np.int64) * 10 * MS
 
 def gathered(clock, t_ns):
     """Rows and their times from all chunks: (timeline to times by row)."""
-    found = {SESSION_TIME: {}, GAIT_CYCLE: {}}
+    row_times = {SESSION_TIME: {}, GAIT_CYCLE: {}}
     for rows, columns in clock.rows(t_ns):
         assert rows.stop - rows.start <= ROWS_PER_CHUNK
         for column in columns:
             times = column.times.cast("int64").to_pylist()
             assert len(times) == rows.stop - rows.start
-            found[column.timeline] |= dict(zip(range(rows.start, rows.stop), times, strict=True))
-    return found
+            row_times[column.timeline] |= dict(
+                zip(range(rows.start, rows.stop), times, strict=True)
+            )
+    return row_times
 
 
 def test_session_time_counts_nanoseconds_from_the_start():
     start = 1_735_689_600_000_000_007
-    found = gathered(TimeColumns(start), start + T)
-    assert list(found[SESSION_TIME].values()) == T.tolist()
-    assert not found[GAIT_CYCLE]
+    rows = gathered(TimeColumns(start), start + T)
+    assert list(rows[SESSION_TIME].values()) == T.tolist()
+    assert not rows[GAIT_CYCLE]
 
 
 def test_every_row_is_in_exactly_one_chunk_and_in_order():
@@ -49,8 +51,8 @@ def test_every_row_is_in_exactly_one_chunk_and_in_order():
 def test_a_cycle_is_a_second_whether_the_phase_was_wrapped_or_not(wrap):
     phase = 2 * np.pi * 0.5 * T / 1e9 + 0.3
     logged = np.angle(np.exp(1j * phase)) if wrap else phase
-    found = gathered(TimeColumns(0, LoggedRhythm.from_phase(T, logged)), T)
-    cycles = np.array(list(found[GAIT_CYCLE].values())) / 1e9
+    rows = gathered(TimeColumns(0, LoggedRhythm.from_phase(T, logged)), T)
+    cycles = np.array(list(rows[GAIT_CYCLE].values())) / 1e9
     np.testing.assert_allclose(cycles, phase / (2 * np.pi), atol=1e-9)
 
 
@@ -62,9 +64,9 @@ def test_a_phase_that_runs_backwards_counts_down():
 def test_rows_without_a_phase_are_on_session_time_only():
     phase = 2 * np.pi * T / 1e9
     logged = (T >= 1000 * MS) & ~((T > 2000 * MS) & (T < 2500 * MS))
-    found = gathered(TimeColumns(0, LoggedRhythm.from_phase(T[logged], phase[logged])), T)
-    assert list(found[SESSION_TIME]) == list(range(len(T)))
-    assert list(found[GAIT_CYCLE]) == np.flatnonzero(logged).tolist()
+    rows = gathered(TimeColumns(0, LoggedRhythm.from_phase(T[logged], phase[logged])), T)
+    assert list(rows[SESSION_TIME]) == list(range(len(T)))
+    assert list(rows[GAIT_CYCLE]) == np.flatnonzero(logged).tolist()
 
 
 def test_no_rows_make_no_chunks():
@@ -95,8 +97,8 @@ def test_a_chunk_has_4096_rows():
 
 def test_a_cycle_is_rounded_to_its_nanosecond():
     t = np.arange(4, dtype=np.int64)
-    found = gathered(TimeColumns(0, LoggedRhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
-    assert list(found[GAIT_CYCLE].values()) == [0, 2, 2, 250_000_000]
+    rows = gathered(TimeColumns(0, LoggedRhythm(t, np.array([0.0, 1.6e-9, 2.4e-9, 0.25]))), t)
+    assert list(rows[GAIT_CYCLE].values()) == [0, 2, 2, 250_000_000]
 
 
 def test_a_span_without_bounds_holds_every_time():

@@ -24,15 +24,15 @@ def test_joints_with_the_same_times_share_one_table():
 
 
 def test_joints_with_times_of_their_own_keep_them():
-    found = tracks.tables([track("a"), track("b", T + 3), track("c")])
-    assert [table.names for table in found] == [("a", "c"), ("b",)]
-    np.testing.assert_array_equal(found[1].t_ns, T + 3)
+    tables = tracks.tables([track("a"), track("b", T + 3), track("c")])
+    assert [table.names for table in tables] == [("a", "c"), ("b",)]
+    np.testing.assert_array_equal(tables[1].t_ns, T + 3)
 
 
 def test_nan_that_fills_up_foreign_messages_is_left_out():
-    found = tracks.without_filler(track("a", T, np.array([0.0, np.nan, np.nan, np.nan, 4.0])))
-    np.testing.assert_array_equal(found.t_ns, [0, 40])
-    np.testing.assert_array_equal(found.values, [0.0, 4.0])
+    kept = tracks.without_filler(track("a", T, np.array([0.0, np.nan, np.nan, np.nan, 4.0])))
+    np.testing.assert_array_equal(kept.t_ns, [0, 40])
+    np.testing.assert_array_equal(kept.values, [0.0, 4.0])
 
 
 def test_half_of_the_samples_or_more_are_fillers():
@@ -58,9 +58,9 @@ def test_a_lost_sample_stays_a_hole():
 
 def test_resampling_puts_columns_in_order_and_leaves_unknown_joints_nan():
     b = track("b", T + 5)
-    found = tracks.resampled([b, track("a")], ("a", "x", "b"), T[1:3], tracks.interpolate)
-    np.testing.assert_allclose(found[:, [0, 2]], [[1.0, 0.5], [2.0, 1.5]])
-    assert np.isnan(found[:, 1]).all()
+    resampled = tracks.resampled([b, track("a")], ("a", "x", "b"), T[1:3], tracks.interpolate)
+    np.testing.assert_allclose(resampled[:, [0, 2]], [[1.0, 0.5], [2.0, 1.5]])
+    assert np.isnan(resampled[:, 1]).all()
     held = tracks.resampled([b], ("b",), T[1:3], tracks.hold)
     np.testing.assert_array_equal(held, [[0.0], [1.0]])
 
@@ -124,21 +124,21 @@ def test_a_rate_keeps_at_most_that_many_samples_a_second():
     st.floats(-5, 5),
     st.lists(st.integers(0, 1200), min_size=1, max_size=20),
 )
-def test_a_straight_line_is_interpolated_exactly_or_not_at_all(steps, slope, offset, wanted):
+def test_a_straight_line_is_interpolated_exactly_or_not_at_all(steps, slope, offset, at_ms):
     t = np.cumsum(np.array(steps, dtype=np.int64)) * MS
-    at = np.array(wanted, dtype=np.int64) * MS
-    found = tracks.interpolate(t, slope * t / MS + offset, at)
-    known = np.isfinite(found)
-    np.testing.assert_allclose(found[known], (slope * at / MS + offset)[known], atol=1e-9)
-    assert not known[(at < t[0]) | (at > t[-1])].any()
-    assert known[np.isin(at, t)].all()
+    at = np.array(at_ms, dtype=np.int64) * MS
+    interpolated = tracks.interpolate(t, slope * t / MS + offset, at)
+    finite = np.isfinite(interpolated)
+    np.testing.assert_allclose(interpolated[finite], (slope * at / MS + offset)[finite], atol=1e-9)
+    assert not finite[(at < t[0]) | (at > t[-1])].any()
+    assert finite[np.isin(at, t)].all()
 
 
 def test_nothing_is_drawn_across_a_gap():
     t = ticks(0, 10, 20, 30, 200, 210)
     assert tracks.gaps(t).tolist() == [False, False, False, True, False]
-    found = tracks.interpolate(t, np.arange(6.0), ticks(25, 30, 35, 100, 200, 205))
-    np.testing.assert_array_equal(found, [2.5, 3.0, np.nan, np.nan, 4.0, 4.5])
+    interpolated = tracks.interpolate(t, np.arange(6.0), ticks(25, 30, 35, 100, 200, 205))
+    np.testing.assert_array_equal(interpolated, [2.5, 3.0, np.nan, np.nan, 4.0, 4.5])
 
 
 @pytest.mark.parametrize(
@@ -149,18 +149,18 @@ def test_nothing_is_drawn_across_a_gap():
     ],
 )
 def test_a_missing_sample_spoils_its_neighbourhood_only(t, values, at, expected):
-    found = tracks.interpolate(ticks(*t), np.array(values), ticks(*at))
-    np.testing.assert_array_equal(found, expected)
+    interpolated = tracks.interpolate(ticks(*t), np.array(values), ticks(*at))
+    np.testing.assert_array_equal(interpolated, expected)
 
 
 def test_a_command_is_held_until_the_next():
     at = ticks(-1, 0, 9, 10, 19, 69, 71)
-    found = tracks.hold(ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), at)
-    np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
+    held = tracks.hold(ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), at)
+    np.testing.assert_array_equal(held, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
     table = tracks.hold(ticks(0, 10), np.array([[1.0, 2.0], [3.0, 4.0]]), ticks(-5, 5, 60, 61))
     np.testing.assert_array_equal(table, [[NAN, NAN], [1.0, 2.0], [3.0, 4.0], [NAN, NAN]])
-    one = tracks.hold(ticks(5), np.array([1.0]), ticks(4, 5, 6))  # nobody knows for how long
-    np.testing.assert_array_equal(one, [NAN, 1.0, NAN])
+    alone = tracks.hold(ticks(5), np.array([1.0]), ticks(4, 5, 6))  # nobody knows for how long
+    np.testing.assert_array_equal(alone, [NAN, 1.0, NAN])
 
 
 def test_without_samples_nothing_is_known():
@@ -177,24 +177,24 @@ def test_a_gap_gets_one_row_of_nan_a_step_after_its_last_sample():
 
 def test_silence_before_the_end_is_a_gap():
     t, values = ticks(0, 10, 20), np.zeros((3, 2))
-    found = tracks.mark_gaps(t, values, end_ns=100 * MS)
-    np.testing.assert_array_equal(found[0], ticks(0, 10, 20, 30))
-    assert np.isnan(found[1][-1]).all()
+    marked = tracks.mark_gaps(t, values, end_ns=100 * MS)
+    np.testing.assert_array_equal(marked[0], ticks(0, 10, 20, 30))
+    assert np.isnan(marked[1][-1]).all()
     same = tracks.mark_gaps(t, values, end_ns=70 * MS)  # five steps are none yet
     assert same[0] is t
     both = tracks.mark_gaps(ticks(0, 10, 20, 100), np.zeros((4, 1)), end_ns=200 * MS)
     np.testing.assert_array_equal(both[0], ticks(0, 10, 20, 30, 100, 110))
     whole = tracks.mark_gaps(t, values, end_ns=40 * MS)
-    assert all(one is given for one, given in zip(whole, (t, values), strict=True))
+    assert all(part is given for part, given in zip(whole, (t, values), strict=True))
 
 
 @given(st.lists(st.integers(0, 9), max_size=8))
 def test_any_order_becomes_that_of_a_stable_sort(times):
     t, values = np.array(times, dtype=np.int64), np.arange(float(len(times)))
-    found = tracks.ordered(t, values)
+    ordered = tracks.ordered(t, values)
     order = sorted(range(len(times)), key=times.__getitem__)
-    np.testing.assert_array_equal(found[0], t[order])
-    np.testing.assert_array_equal(found[1], values[order])
+    np.testing.assert_array_equal(ordered[0], t[order])
+    np.testing.assert_array_equal(ordered[1], values[order])
 
 
 def test_samples_out_of_order_are_sorted():
@@ -248,7 +248,7 @@ def test_a_step_follows_the_range_of_nearly_all_samples():
 
 def test_a_flat_line_and_no_line_are_left_alone():
     flat = (np.full(10, 3.3), np.zeros(0), np.full(3, np.nan))
-    assert [tracks.plot_step(one) for one in flat] == [0, 0, 0]
+    assert [tracks.plot_step(line) for line in flat] == [0, 0, 0]
     values = np.array([[0.1, 0.1], [np.nan, 0.3]])
     np.testing.assert_array_equal(tracks.rounded(values, [0.0, 0.0]), values)
     np.testing.assert_array_equal(tracks.rounded(values, [0.25, 0.0]), [[0.0, 0.1], [np.nan, 0.3]])

@@ -33,7 +33,7 @@ def local(tmp_path_factory):
 
 def pids(output):
     """Processes that made the rows that are there, by id, the latest first."""
-    files = sorted(output.glob("pending/*.json"), key=lambda one: -one.stat().st_mtime_ns)
+    files = sorted(output.glob("pending/*.json"), key=lambda file: -file.stat().st_mtime_ns)
     names = [json.loads(file.read_text())["worker"] for file in files]
     return list(dict.fromkeys(int(name.rpartition(":")[2]) for name in names))
 

@@ -27,8 +27,8 @@ def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
     again = json.loads(undulog("sweep", plan, "-o", url, "--json").stdout)
     assert (again["run"], again["there_before"]) == (0, 2)
 
-    found = bucket.list_objects_v2(Bucket="robots")["Contents"]
-    names = [one["Key"] for one in found if one["Size"]]
+    objects = bucket.list_objects_v2(Bucket="robots")["Contents"]
+    names = [entry["Key"] for entry in objects if entry["Size"]]
     assert [name.split("/")[1] for name in names] == ["rows", "sessions", "sessions", "settings"]
     bucket.download_file("robots", names[0], str(tmp_path / "rows.parquet"))
     assert pd.read_parquet(tmp_path / "rows.parquet").status.to_list() == ["done", "done"]

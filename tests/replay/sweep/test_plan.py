@@ -29,7 +29,7 @@ def test_a_grid_has_every_combination_once_and_each_seed(tmp_path):
     path.write_text(path.read_text() + '[parameters."noise.position"]\nvalues = [0.0, 0.01]\n')
     runs = list(runs_of(read_plan(path)))
     assert (len(runs), {seed for _, seed in runs}) == (12, {7, 8})
-    pairs = {(one["servo.stall_torque"], one["noise.position"]) for one, _ in runs}
+    pairs = {(changes["servo.stall_torque"], changes["noise.position"]) for changes, _ in runs}
     assert pairs == {(a, b) for a in (0.1, 0.2, 0.3) for b in (0.0, 0.01)}
 
 
@@ -56,7 +56,9 @@ def test_a_sobol_design_covers_better_than_chance():
         points = points_of(planned(design, 256, STRENGTH, Parameter("x", low=0.0, high=1.0)))
         return np.array([[math.log10(p["servo.stall_torque"]) / 2 + 0.5, p["x"]] for p in points])
 
-    even, chance = (stats.qmc.discrepancy(shares(one)) for one in (Design.SOBOL, Design.RANDOM))
+    even, chance = (
+        stats.qmc.discrepancy(shares(design)) for design in (Design.SOBOL, Design.RANDOM)
+    )
     assert even < chance / 5
 
 

@@ -29,8 +29,8 @@ def parquet(store):
 
 def test_rows_are_whole_in_parquet_and_before(store):
     rows = [row(k, gain=[1.0, None], joint=["a", "b"], x=k / 3) for k in range(GATHER + 3)]
-    for one in rows:
-        store.add(one)
+    for record in rows:
+        store.add(record)
     assert comparable(store.rows()) == comparable(rows)
     store.gather()
     assert comparable(RowStore(store.where).rows()) == comparable(rows)
@@ -54,8 +54,8 @@ def test_columns_of_failed_rows_and_of_other_types_fit_together(store):
 
 def test_rows_that_were_gathered_but_not_removed_are_there_once(store, tmp_path):
     rows = [row(k) for k in range(5)]
-    for one in rows:
-        store.add(one)
+    for record in rows:
+        store.add(record)
     pending = {path: path.read_bytes() for path in (tmp_path / "rows" / "pending").iterdir()}
     store.gather()
     for path, data in pending.items():  # as if killed between the two

@@ -97,8 +97,8 @@ def test_gain_and_lag_over_5_s_are_those_of_the_twin_on_mujoco(weak):
     (run,) = run_batch([scenario])
     yaw = scenario.robot.joint_indices(Plane.HORIZONTAL)
     expected = response(angles(on_mujoco(scenario))[:, yaw], run.command[:, yaw], 0.5, 1)
-    found = response(run.angle[:, yaw], run.command[:, yaw], 0.5, 1)
-    np.testing.assert_allclose(found, expected, atol=1e-11)  # the bar is 1e-5
+    measured = response(run.angle[:, yaw], run.command[:, yaw], 0.5, 1)
+    np.testing.assert_allclose(measured, expected, atol=1e-11)  # the bar is 1e-5
 
 
 @pytest.mark.nightly
@@ -126,21 +126,23 @@ def test_everything_of_an_uneven_robot_in_both_planes_is_the_twins(uneven, law):
     assert run.command == pytest.approx(
         np.array([sample.gait.command for sample in samples]), abs=1e-15
     )
-    assert run.angle == pytest.approx(np.array([one.angle for one in body]), abs=1e-11)
-    assert run.rate == pytest.approx(np.array([one.rate for one in body]), abs=1e-9)
-    assert run.head == pytest.approx(np.array([one.position[:, 0] for one in body]), abs=1e-11)
-    velocity = np.array([one.velocity[:, 0] for one in body])
+    assert run.angle == pytest.approx(np.array([state.angle for state in body]), abs=1e-11)
+    assert run.rate == pytest.approx(np.array([state.rate for state in body]), abs=1e-9)
+    assert run.head == pytest.approx(np.array([state.position[:, 0] for state in body]), abs=1e-11)
+    velocity = np.array([state.velocity[:, 0] for state in body])
     assert run.head_velocity == pytest.approx(velocity, abs=1e-9)
-    turned = (run.head_quaternion * np.array([one.quaternion[:, 0] for one in body])).sum(axis=1)
+    turned = (run.head_quaternion * np.array([state.quaternion[:, 0] for state in body])).sum(
+        axis=1
+    )
     assert np.abs(turned) == pytest.approx(np.ones(len(body)), abs=1e-12)
     mass = np.array([link.mass for link in scenario.robot.links])
-    centre = np.array([one.position @ mass / mass.sum() for one in body])
+    centre = np.array([state.position @ mass / mass.sum() for state in body])
     assert run.centre_of_mass == pytest.approx(centre, abs=1e-11)
     work = np.array([sample.joint_energy[[0, 2, 3, 4]] for sample in samples]).swapaxes(0, 1)
     assert run.work == pytest.approx(work, abs=1e-9)
     polled = [joint for sample in samples for joint in sample.sensed]  # means around each tick
     for name in ("effort", "current", "voltage"):
-        expected = np.array([getattr(one, name) for one in polled])
+        expected = np.array([getattr(sample, name) for sample in polled])
         assert getattr(run, name)[: len(expected)] == pytest.approx(expected, abs=1e-9)
 
 
@@ -246,7 +248,9 @@ def test_a_run_that_fails_ends_alone_with_its_time_and_place(weak, make_scenario
     np.testing.assert_array_equal(fine.angle, run_batch([weak])[0].angle)
     with pytest.raises(SimulationError) as single:
         on_mujoco(broken)
-    when = [float(re.search(r"at ([0-9.]+) s", str(one))[1]) for one in (first.error, single.value)]
+    when = [
+        float(re.search(r"at ([0-9.]+) s", str(error))[1]) for error in (first.error, single.value)
+    ]
     assert when[0] == pytest.approx(when[1], abs=1.1e-3)  # the twin looks at each axis by itself
     assert re.search(r"link\d+ moves at|the servo of joint\d+ turns at", str(first.error))
     assert "gear_stiffness is too stiff" in str(first.error)
@@ -261,14 +265,14 @@ def test_a_run_that_fails_ends_alone_with_its_time_and_place(weak, make_scenario
 
 def test_given_commands_run_as_the_gait_that_gives_them(weak):
     """Also those of a scenario whose own gait a batch can't run."""
-    (own,) = run_batch([weak])
+    (by_gait,) = run_batch([weak])
     adaptive = load_scenario("oscillators-feedback")
     driven = dataclasses.replace(weak, gait=adaptive.gait)
-    (run,) = run_batch([driven], commands=[own.command])
+    (run,) = run_batch([driven], commands=[by_gait.command])
     for name in ("angle", "effort", "work", "head"):
-        np.testing.assert_array_equal(getattr(run, name), getattr(own, name))
+        np.testing.assert_array_equal(getattr(run, name), getattr(by_gait, name))
     with pytest.raises(ValueError, match=r"expected \d+ ticks of"):
-        run_batch([weak], commands=[own.command[:-1]])
+        run_batch([weak], commands=[by_gait.command[:-1]])
 
 
 def test_commands_within_control_periods_are_those_of_the_twins_plant(weak):
@@ -335,17 +339,20 @@ def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
 
     Contact begins and ends within a step, and magnifies rounding.
     """
-    one = with_law(uneven, law).changed(duration_s=0.12)
-    runs = [one, dataclasses.replace(one, world=dataclasses.replace(one.world, heading=1.2))]
+    scenario = with_law(uneven, law).changed(duration_s=0.12)
+    runs = [
+        scenario,
+        dataclasses.replace(scenario, world=dataclasses.replace(scenario.world, heading=1.2)),
+    ]
     (tmp_path / "runs").write_bytes(pickle.dumps(runs))
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
     python(GPU, tmp_path / "runs", tmp_path / "done.npz", "float64", env=environment, code=0)
-    expected = [part for one in run_batch(runs) for part in (one.angle, one.work, one.head)]
+    expected = [part for run in run_batch(runs) for part in (run.angle, run.work, run.head)]
     assert abs(expected[0][-1]).max() > 1e-3
-    with np.load(tmp_path / "done.npz") as found:
-        for name, part in zip(found.files, expected, strict=True):
+    with np.load(tmp_path / "done.npz") as outputs:
+        for name, part in zip(outputs.files, expected, strict=True):
             np.testing.assert_allclose(
-                found[name], part, rtol=0, atol=1e-13 if law is None else 1e-7
+                outputs[name], part, rtol=0, atol=1e-13 if law is None else 1e-7
             )
 
 

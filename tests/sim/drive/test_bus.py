@@ -97,9 +97,9 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, co
     command(*words, "--on", "twin", "-o", direct)
     with Session.open(path) as over_bus, Session.open(direct) as in_process:
         for topic, like in TOPICS.items():
-            found, expected = over_bus.joints(topic), in_process.joints(like)
-            np.testing.assert_array_equal(found.values, expected.values)
-            np.testing.assert_array_equal(found.t_ns, expected.t_ns)
+            driven, expected = over_bus.joints(topic), in_process.joints(like)
+            np.testing.assert_array_equal(driven.values, expected.values)
+            np.testing.assert_array_equal(driven.t_ns, expected.t_ns)
         assert (over_bus.verdict, over_bus.warnings) == ("good", [])
         facts = over_bus.metadata["undulog"]
         assert (facts["driven"], facts["armed"], facts["source.can0"]) == ("gait", "yes", on)
@@ -113,10 +113,10 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, co
     cycles = np.array([sample.position for sample in samples if isinstance(sample, JointSample)])[
         :-2
     ]
-    found = np.array(measured.values)
-    assert not found[:, 0].any()  # how it stood before the first command
-    found = found[:, 1 : 1 + len(cycles)]
-    assert np.abs(found - cycles[: found.shape[1]].T).max() <= STEP / 2 * (1 + 1e-6)
+    driven = np.array(measured.values)
+    assert not driven[:, 0].any()  # how it stood before the first command
+    driven = driven[:, 1 : 1 + len(cycles)]
+    assert np.abs(driven - cycles[: driven.shape[1]].T).max() <= STEP / 2 * (1 + 1e-6)
 
 
 @pytest.mark.nightly
@@ -300,7 +300,7 @@ def test_any_bus_of_python_can_will_do(tmp_path):
         report = drive_bus(plan, stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     assert report.approach_s >= LISTEN_S + 1.5 * 0.1 / 0.5 - 0.02
-    assert {len(each) for each in taken.values()} == {report.tally.sent // 25}
+    assert {len(commands) for commands in taken.values()} == {report.tally.sent // 25}
     raw = angles_of(taken)
     assert np.abs(np.diff(raw)).max() * STEP <= 4.0 * 0.01 + STEP  # also where ticks were late
     with Session.open(tmp_path / "a.mcap") as session:

@@ -22,12 +22,12 @@ STOPPED = Outcome(DriveEnding.STOPPED, "asked", "the joints were held")
 
 def frames(*rows, way=DIR_RX):
     """Frames: identifier, time of the host and of the device [ms]."""
-    found = empty_frames(len(rows))
-    for frame, (identifier, host_ms, device_ms) in zip(found, rows, strict=True):
+    table = empty_frames(len(rows))
+    for frame, (identifier, host_ms, device_ms) in zip(table, rows, strict=True):
         frame["id_flags"], frame["dlc"], frame["dir"] = identifier, 8, way
         frame["t_host_ns"] = EPOCH_NS + host_ms * MS
         frame["t_device_ns"] = NO_TIME if device_ms is None else device_ms * MS
-    return found
+    return table
 
 
 def tick(
@@ -52,8 +52,8 @@ def written(tmp_path):
         path = tmp_path / f"{len(opened)}.mcap"
         plan = bus_plan(find_motion("flat"), "can:virtual:one", path)
         session = BusSession(plan, ClockDomain.DEVICE, EPOCH_NS, names)
-        for one in ticks:
-            session.write(one, EPOCH_NS + 10 * MS * one.tick)
+        for bus_tick in ticks:
+            session.write(bus_tick, EPOCH_NS + 10 * MS * bus_tick.tick)
         if more is not None:
             more(session)
         if end is not None:
@@ -65,8 +65,8 @@ def written(tmp_path):
         return opened[-1]
 
     yield write
-    for one in opened:
-        one.close()
+    for log in opened:
+        log.close()
 
 
 def remarks_of(session):
@@ -91,7 +91,7 @@ def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
     np.testing.assert_array_equal(meant.values, [2.0, 4.0, 6.0])
 
     def changes(topic):
-        return [((t_ns - EPOCH_NS) / MS, one.data) for t_ns, one in session.messages(topic)]
+        return [((t_ns - EPOCH_NS) / MS, message.data) for t_ns, message in session.messages(topic)]
 
     assert changes("/gait/mode") == [(20, "walk"), (30, "turn")]
     assert changes("/gate/phase") == [
@@ -115,7 +115,7 @@ def test_each_tick_writes_what_was_sent_wanted_and_meant(written):
 def test_a_gait_without_values_has_a_mode_only(written):
     session = written(tick(0, GatePhase.RUN, 0.0, gait(1.0)), names=())
     assert "/gait" not in session.channels
-    assert [one.data for _, one in session.messages("/gait/mode")] == ["walk"]
+    assert [message.data for _, message in session.messages("/gait/mode")] == ["walk"]
 
 
 def test_all_frames_are_kept_and_what_was_sent_has_the_devices_time(written):
@@ -128,22 +128,22 @@ def test_all_frames_are_kept_and_what_was_sent_has_the_devices_time(written):
         ),
         tick(2, received=[frames((0x201, 20, 125))], sent=frames((0x101, 21, 0), way=DIR_TX)),
     )
-    found = session.frames("/can/one")
-    ours = found[found["dir"] == DIR_TX]
+    recorded = session.frames("/can/one")
+    ours = recorded[recorded["dir"] == DIR_TX]
     assert ours["id_flags"].tolist() == [0x101, 0x101, 0x102, 0x101]
     host_ms = (ours["t_host_ns"].astype(np.int64) - EPOCH_NS) / MS
     assert host_ms.tolist() == [0, 11, 12, 21]
     assert ours["t_device_ns"][0] == EPOCH_NS  # as if the clocks were the same
     device_ms = ours["t_device_ns"][1:].astype(np.int64) / MS
     assert device_ms.tolist() == [113, 114, 126]  # 102 and 105 ms ahead
-    others = found[found["dir"] == DIR_RX]
+    others = recorded[recorded["dir"] == DIR_RX]
     assert others["id_flags"].tolist() == [0x201, 0x202, 0x203, 0x201]
 
 
 def test_an_echo_of_a_joints_own_frame_is_no_angle_of_it(written):
-    own = frames((0x201, 10, 10), (0x202, 10, 10))
+    joint_frames = frames((0x201, 10, 10), (0x202, 10, 10))
     echo = frames((0x201, 20, 20), way=DIR_TX)
-    session = written(tick(1, received=[own]), tick(2, sent=echo), tick(20))
+    session = written(tick(1, received=[joint_frames]), tick(2, sent=echo), tick(20))
     states = session.joints("/joint_states")
     assert [states.signal(f"joint0{k}").t_ns.size for k in (1, 2)] == [1, 1]
 
@@ -152,8 +152,8 @@ def test_a_time_before_the_devices_own_is_its_first_one(written):
     session = written(
         tick(0, received=[frames((0x201, 50, 0))], sent=frames((0x101, 10, 0), way=DIR_TX))
     )
-    found = session.frames("/can/one")
-    assert found[found["dir"] == DIR_TX]["t_device_ns"].tolist() == [0]
+    recorded = session.frames("/can/one")
+    assert recorded[recorded["dir"] == DIR_TX]["t_device_ns"].tolist() == [0]
 
 
 def test_an_event_is_written_once(written):
@@ -195,7 +195,7 @@ def test_the_verdict_follows_the_outcome_and_the_warnings(
     (_, first), *others = session.messages("/rosout")
     assert first.msg == (f"{how}: {why}; at rest" if why else f"{how}; at rest")
     assert (first.level, first.name) == (level, "drive")
-    assert [one.msg for _, one in others] == [text for _, text in remarks]
+    assert [event.msg for _, event in others] == [text for _, text in remarks]
     assert session.verdict == verdict
     reasons = session.metadata["undulog.health"].get("reasons", "[]")
     assert ("lost" in reasons, "left out" in reasons) == (
@@ -206,19 +206,21 @@ def test_the_verdict_follows_the_outcome_and_the_warnings(
 
 
 def test_a_failure_is_the_verdict(written):
-    session = written(tick(0), end=None, more=lambda one: one.fail("no gait"))
+    session = written(tick(0), end=None, more=lambda writer: writer.fail("no gait"))
     assert (session.verdict, remarks_of(session)) == ("bad", ["no gait"])
 
 
 def test_in_lockstep_frames_have_the_time_of_their_tick():
     received = [frames((0x201, 1, 2)), frames((0x202, 3, 4), (0x203, 5, 6))]
     sent = frames((0x101, 7, 8), way=DIR_TX)
-    found = stamped(BusTick(4, None, received, sent), EPOCH_NS)
+    stamped_tick = stamped(BusTick(4, None, received, sent), EPOCH_NS)
     assert {
-        time for one in (*found.received, found.sent) for time in one["t_host_ns"].tolist()
+        time
+        for block in (*stamped_tick.received, stamped_tick.sent)
+        for time in block["t_host_ns"].tolist()
     } == {EPOCH_NS}
-    assert found.received[1]["t_device_ns"].tolist() == [4 * MS, 6 * MS]
-    assert (found.tick, len(found.sent)) == (4, 1)
+    assert stamped_tick.received[1]["t_device_ns"].tolist() == [4 * MS, 6 * MS]
+    assert (stamped_tick.tick, len(stamped_tick.sent)) == (4, 1)
     assert sent["t_host_ns"].tolist() == [EPOCH_NS + 7 * MS]  # copies
 
 

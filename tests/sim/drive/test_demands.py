@@ -64,16 +64,16 @@ def test_limits_that_are_infinite_are_none():
 
 
 def test_rates_and_accelerations_are_differences_of_commands():
-    found = tally()
+    demands = tally()
     for first, second in ((0.1, 0.0), (0.13, 0.0), (0.14, -0.02), (0.05, -0.02)):
-        found.command(row(first, second), np.array([first > 0.12, *[False] * (COUNT - 1)]))
-    one, two, *_ = found.joints()
-    assert (one.least, one.greatest) == (0.05, 0.14)
-    assert one.rate == pytest.approx(9.0)  # 0.09 rad in 10 ms
-    assert one.acceleration == pytest.approx(1000.0)  # from 0.01 to -0.09 rad in a tick
-    assert one.clamped == 0.5
-    assert (two.least, two.greatest, two.clamped) == (-0.02, 0.0, 0.0)
-    assert (two.rate, two.acceleration) == pytest.approx((2.0, 200.0))
+        demands.command(row(first, second), np.array([first > 0.12, *[False] * (COUNT - 1)]))
+    first_joint, second_joint, *_ = demands.joints()
+    assert (first_joint.least, first_joint.greatest) == (0.05, 0.14)
+    assert first_joint.rate == pytest.approx(9.0)  # 0.09 rad in 10 ms
+    assert first_joint.acceleration == pytest.approx(1000.0)  # from 0.01 to -0.09 rad in a tick
+    assert first_joint.clamped == 0.5
+    assert (second_joint.least, second_joint.greatest, second_joint.clamped) == (-0.02, 0.0, 0.0)
+    assert (second_joint.rate, second_joint.acceleration) == pytest.approx((2.0, 200.0))
     begun = tally()  # it rests in the first pose before
     begun.command(row(0.3), np.zeros(COUNT, dtype=bool))
     assert (begun.joints()[0].rate, begun.joints()[0].acceleration) == (0.0, 0.0)
@@ -83,32 +83,32 @@ def test_rates_and_accelerations_are_differences_of_commands():
 
 
 def test_torques_and_currents_are_those_that_servos_report():
-    found = tally()
-    found.receive([sample((0.3, -0.1), (0.2, -0.9)), SimpleNamespace(effort=9.0)])
-    found.receive([])
-    found.receive([sample((-0.4, 0.1), (0.1, 0.3)), sample((0.0, 0.1), (0.0, 0.0))])
-    one, two, *_ = found.joints()
-    assert (one.torque_peak, two.torque_peak) == (0.4, 0.1)
-    assert one.torque_rms == pytest.approx(np.sqrt(np.mean([0.3**2, 0.4**2, 0.0])))
-    assert two.torque_rms == pytest.approx(0.1)
-    assert (one.current_peak, two.current_peak) == (0.2, 0.9)
+    demands = tally()
+    demands.receive([sample((0.3, -0.1), (0.2, -0.9)), SimpleNamespace(effort=9.0)])
+    demands.receive([])
+    demands.receive([sample((-0.4, 0.1), (0.1, 0.3)), sample((0.0, 0.1), (0.0, 0.0))])
+    first_joint, second_joint, *_ = demands.joints()
+    assert (first_joint.torque_peak, second_joint.torque_peak) == (0.4, 0.1)
+    assert first_joint.torque_rms == pytest.approx(np.sqrt(np.mean([0.3**2, 0.4**2, 0.0])))
+    assert second_joint.torque_rms == pytest.approx(0.1)
+    assert (first_joint.current_peak, second_joint.current_peak) == (0.2, 0.9)
 
 
 def test_the_tracking_error_is_the_largest_that_is_known():
-    found = tally()
+    demands = tally()
     for error in (row(0.1, NAN), row(-0.2, NAN), row(NAN, NAN)):
-        found.measured(error)
-    one, two, *_ = found.joints()
-    assert one.tracking_error == 0.2
-    assert np.isnan(two.tracking_error)
+        demands.measured(error)
+    first_joint, second_joint, *_ = demands.joints()
+    assert first_joint.tracking_error == 0.2
+    assert np.isnan(second_joint.tracking_error)
 
 
 def test_energies_count_from_the_first_one():
-    found = tally()
+    demands = tally()
     for k in (1, 2, 5):
         flows = k * np.arange(1.0, len(JOINT_TERMS) + 1)[:, None] * np.arange(1.0, COUNT + 1)
-        found.energy(flows)
-    for number, joint in enumerate(found.joints(), start=1):
+        demands.energy(flows)
+    for number, joint in enumerate(demands.joints(), start=1):
         for name, value in (
             ("mechanical_net", joint.energy_net_j),
             ("mechanical_abs", joint.energy_abs_j),
@@ -141,36 +141,36 @@ def gated(gait, duration_s=1.0, **more):
     """The gate of a gait, whose robot is where it was commanded to be: a function of ticks."""
     inner, given = NotedGait(gait, ROBOT), limits(**more)
     gate = Gate(inner, given, duration_s=duration_s, place="the twin")
-    found = GatedGait(inner, gate, ROBOT, given)
-    found.twin = SimpleNamespace(sensed=[])
+    gated_gait = GatedGait(inner, gate, ROBOT, given)
+    gated_gait.twin = SimpleNamespace(sensed=[])
     angle = [np.zeros(COUNT)]
 
     def run(ticks, current=0.0, behind=0.0):
         ran = []
         for _ in range(ticks):
-            found.twin.sensed = [sample((0.1,), (current,))]
-            ran.append(found.step(99.0, Readings(angle[0] - row(behind), np.zeros(COUNT))))
+            gated_gait.twin.sensed = [sample((0.1,), (current,))]
+            ran.append(gated_gait.step(99.0, Readings(angle[0] - row(behind), np.zeros(COUNT))))
             angle[0] = ran[-1].command
         return ran
 
-    return inner, gate, found, run
+    return inner, gate, gated_gait, run
 
 
 def test_before_the_gait_begins_the_gate_moves_and_says_its_phase():
-    inner, gate, found, run = gated(Steps(0.099))
+    inner, gate, gated_gait, run = gated(Steps(0.099))
     ticks = run(14)  # 1.5 x 0.099 rad at 1 rad/s are 149 ms
     assert {tick.mode for tick in ticks} == {"approach"}
     assert all(np.isnan(tick.values).all() and tick.clamped == () for tick in ticks)
-    assert found.tally.joints()[0].greatest == -np.inf
+    assert gated_gait.tally.joints()[0].greatest == -np.inf
     np.testing.assert_array_equal(inner.first, row(0.099))
     (begun,) = run(1)
     assert (begun.mode, begun.values.tolist(), gate.phase) == ("walk", [1.0], GatePhase.RUN)
     np.testing.assert_allclose(begun.command, row(0.099))
-    texts = [remark.text for remark in found.fresh_remarks()]
+    texts = [remark.text for remark in gated_gait.fresh_remarks()]
     assert [text.split(",")[0] for text in texts] == [
         "gate: reading the pose", "gate: approach", "gate: run",
     ]  # fmt: skip
-    assert list(found.fresh_remarks()) == []
+    assert list(gated_gait.fresh_remarks()) == []
 
 
 def test_what_the_gait_cuts_is_named_once_in_order():
@@ -184,16 +184,16 @@ def test_what_the_gait_cuts_is_named_once_in_order():
 
 
 def test_demands_are_before_the_gate_and_commands_behind_it():
-    _, gate, found, run = gated(Steps(0.0, 0.1, 0.1, 0.1, 0.1), duration_s=0.05)
+    _, gate, gated_gait, run = gated(Steps(0.0, 0.1, 0.1, 0.1, 0.1), duration_s=0.05)
     ticks = run(6)
     np.testing.assert_allclose(
         [tick.command[0] for tick in ticks], [0.0, 0.04, 0.08, 0.1, 0.1, 0.1]
     )
-    joint = found.tally.joints()[0]
+    joint = gated_gait.tally.joints()[0]
     assert (joint.greatest, joint.rate) == pytest.approx((0.1, 10.0))
     assert joint.clamped == pytest.approx(2 / 6)
     assert gate.done
-    assert [remark.level for remark in found.remarks].count("warn") == 1
+    assert [remark.level for remark in gated_gait.remarks].count("warn") == 1
     (after,) = run(1)
     assert (after.mode, after.values.tolist()) == ("done", [6.0])
     assert joint.torque_peak == pytest.approx(0.1)
@@ -201,24 +201,24 @@ def test_demands_are_before_the_gate_and_commands_behind_it():
 
 
 def test_only_what_is_measured_while_it_runs_counts():
-    _, _, found, run = gated(Steps(0.099), tracking_error=np.full(COUNT, 9.0))
+    _, _, gated_gait, run = gated(Steps(0.099), tracking_error=np.full(COUNT, 9.0))
     run(1)
     run(13, behind=0.05)
-    found.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 100.0)))
+    gated_gait.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 100.0)))
     run(1)
-    assert np.isnan(found.tally.joints()[0].tracking_error)
-    found.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 10.0)))
+    assert np.isnan(gated_gait.tally.joints()[0].tracking_error)
+    gated_gait.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 10.0)))
     run(2, behind=0.02)
-    found.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 12.5)))
-    joint = found.tally.joints()[0]
+    gated_gait.book(SimpleNamespace(joint_energy=np.full((len(JOINT_TERMS), COUNT), 12.5)))
+    joint = gated_gait.tally.joints()[0]
     assert joint.tracking_error == pytest.approx(0.02)
     assert joint.energy_net_j == 2.5
 
 
 def test_the_gate_sees_the_currents_of_the_twin():
-    _, gate, found, run = gated(Steps(0.0), duration_s=60.0)
+    _, gate, gated_gait, run = gated(Steps(0.0), duration_s=60.0)
     run(2, current=1.5)
-    assert any("draws more than 1.4 A" in remark.text for remark in found.remarks)
+    assert any("draws more than 1.4 A" in remark.text for remark in gated_gait.remarks)
     run(40, current=1.5)
     assert gate.outcome.fault.kind == "current"
     assert gate.outcome.fault.value == 1.5

@@ -27,11 +27,11 @@ COLUMNS = (
 def column_bytes(path):
     """All joint columns of a session with their times, as bytes."""
     with Session.open(path) as session:
-        found = [session.joints(topic, field) for topic, field in COLUMNS]
+        tables = [session.joints(topic, field) for topic, field in COLUMNS]
     return [
-        (one.names, t_ns.tobytes(), values.tobytes())
-        for one in found
-        for t_ns, values in zip(one.t_ns, one.values, strict=True)
+        (table.names, t_ns.tobytes(), values.tobytes())
+        for table in tables
+        for t_ns, values in zip(table.t_ns, table.values, strict=True)
     ]
 
 
@@ -50,9 +50,9 @@ def test_driving_a_scenarios_gait_is_running_the_scenario(plain, tmp_path, repor
     assert (report["kind"], report["on"]) == ("gait", "twin:weak-servo-pi3")
     assert (report["complete"], report["ticks"], report["duration_s"]) == (True, 61, 0.6)
     assert column_bytes(path) == column_bytes(plain)
-    with Session.open(path) as session, Session.open(plain) as own:
-        assert set(session.channels) == set(own.channels)
-        assert session.session_id == report["session_id"] != own.session_id
+    with Session.open(path) as session, Session.open(plain) as original:
+        assert set(session.channels) == set(original.channels)
+        assert session.session_id == report["session_id"] != original.session_id
         assert (session.metadata["undulog"]["driven"], session.verdict) == ("gait", "good")
         assert session.warnings == []
 
@@ -62,9 +62,9 @@ def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, comman
     words = ("drive", plain, "--on", "twin", "-o", path)
     assert f"{path}: drove plain.mcap for 0.6 s" in command(*words).out
     assert column_bytes(path) == column_bytes(plain)
-    with Session.open(path) as session, Session.open(plain) as own:
+    with Session.open(path) as session, Session.open(plain) as original:
         facts = session.metadata["undulog"]
-        assert (facts["driven"], facts["driven.session_id"]) == ("commands", own.session_id)
+        assert (facts["driven"], facts["driven.session_id"]) == ("commands", original.session_id)
         assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
     first = path.read_bytes()
     command(*words, "--force")
@@ -73,12 +73,12 @@ def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, comman
 
 def everything(path):
     """All messages of a session but events, by topic: times and bytes."""
-    found = defaultdict(list)
+    by_topic = defaultdict(list)
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
-            found[channel.topic].append((message.log_time, message.publish_time, message.data))
-    del found["/rosout"]
-    return found
+            by_topic[channel.topic].append((message.log_time, message.publish_time, message.data))
+    del by_topic["/rosout"]
+    return by_topic
 
 
 # Among its logged values, target following has some that are not known yet.
@@ -145,8 +145,8 @@ def test_several_motions_are_driven_into_a_folder(plain, tmp_path, command, repo
     plan.write_text(PLAN)
     drive = ("drive", plain, plan, "--on", "twin", "-o", folder)
     report = report_of(*drive)
-    assert [one["driven"] for one in report] == ["plain.mcap", "bend"]
-    assert sorted(one.name for one in folder.iterdir()) == ["bend.mcap", "plain.mcap"]
+    assert [drive["driven"] for drive in report] == ["plain.mcap", "bend"]
+    assert sorted(file.name for file in folder.iterdir()) == ["bend.mcap", "plain.mcap"]
     for what, output in ((plain, folder / "plain.mcap"), (plan, folder / "bend.mcap")):
         command("drive", what, "--on", "twin", "-o", alone, "--force")
         assert output.read_bytes() == alone.read_bytes()
@@ -155,7 +155,10 @@ def test_several_motions_are_driven_into_a_folder(plain, tmp_path, command, repo
     out = command("drive", folder, "--on", "twin", "-o", tmp_path / "again", code=1).out
     names = ["bend.mcap", "broken.mcap", "plain.mcap"]
     assert [Path(line.split()[0]).name for line in out.splitlines()[1:]] == names
-    assert sorted(one.name for one in (tmp_path / "again").iterdir()) == ["bend.mcap", "plain.mcap"]
+    assert sorted(file.name for file in (tmp_path / "again").iterdir()) == [
+        "bend.mcap",
+        "plain.mcap",
+    ]
 
 
 def test_a_log_that_is_cut_short_is_driven_with_a_warning(plain, tmp_path, command):
@@ -289,8 +292,8 @@ def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path, co
     # Driven again in the world of the run, which is turned already.
     command("drive", path, "--on", "twin", "-o", again)
     positions = []
-    for one in (path, again):
-        with Session.open(one) as session:
+    for output in (path, again):
+        with Session.open(output) as session:
             ran = sim.parse_scenario(
                 session.attachments["scenario.toml"].decode(), "s", session.robot
             )

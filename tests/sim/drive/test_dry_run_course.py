@@ -65,12 +65,12 @@ def ramp_s(way):
 
 def test_it_has_the_time_for_the_pose_and_the_longest_ramps_and_ends_with_the_gait(tmp_path):
     driven, made = motion((0.002, 0.0, -0.001))
-    path, told = tmp_path / "a.mcap", []
-    run = dry_run(driven, output=path, on_time=told.append)
+    path, reported_s = tmp_path / "a.mcap", []
+    run = dry_run(driven, output=path, on_time=reported_s.append)
     assert (run.verdict, run.complete, run.started) == (DryRunVerdict.CLAMPED, True, True)
     assert (run.duration_s, run.scenario.duration_s) == (0.05, 0.05)
-    assert told[-6:] == [k / 100 for k in range(6)]
-    assert set(told[:-6]) == {0.0}  # until the pose is known
+    assert reported_s[-6:] == [k / 100 for k in range(6)]
+    assert set(reported_s[:-6]) == {0.0}  # until the pose is known
     ((robot, world, _),) = made
     assert (robot, world) == (run.scenario.robot, run.scenario)
     assert robot == ROBOT
@@ -180,7 +180,9 @@ def test_a_world_for_a_robot_is_level_still_and_as_fine_as_its_gears_need():
     for light in (1.0, 1e-1, 1e-3):
         links = tuple(
             dataclasses.replace(
-                link, mass=light * link.mass, inertia=tuple(light * one for one in link.inertia)
+                link,
+                mass=light * link.mass,
+                inertia=tuple(light * moment for moment in link.inertia),
             )
             for link in ROBOT.links
         )

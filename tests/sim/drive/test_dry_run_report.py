@@ -44,7 +44,7 @@ def dry(**more):
 def test_shares_are_of_the_limits():
     joint = demand()
     assert joint.margin == pytest.approx(0.3)  # -0.2 above -0.5
-    shares = {one.name: one.share for one in joint.demands}
+    shares = {limit.name: limit.share for limit in joint.demands}
     assert shares == pytest.approx(
         {"range": 0.3 / 0.6, "rate": 0.25, "tracking error": 0.2, "current": 0.25, "torque": 0.4}
     )
@@ -75,11 +75,11 @@ def test_the_verdict_is_the_worst_that_is_true(more, verdict, fits):
 
 
 def test_the_closest_limit_is_of_all_joints_and_of_those_that_are_known():
-    joint, one = dry().closest
-    assert (joint, one.name, one.share) == ("joint02", "range", pytest.approx(0.55 / 0.6))
+    joint, limit = dry().closest
+    assert (joint, limit.name, limit.share) == ("joint02", "range", pytest.approx(0.55 / 0.6))
     unknown = demand("joint03", tracking_error=NAN, current_peak=9.0, max_current=NAN)
-    joint, one = dry(joints=(demand(), unknown)).closest
-    assert (joint, one.name) == ("joint01", "range")
+    joint, limit = dry(joints=(demand(), unknown)).closest
+    assert (joint, limit.name) == ("joint01", "range")
     assert dry(joints=()).closest is None
 
 
@@ -192,8 +192,8 @@ def test_the_mean_power_is_that_of_any_length(seconds, power):
     run = dry(duration_s=seconds)
     (line,) = (line for line in summary_lines(run, WIDE) if line.startswith("energy"))
     assert line.endswith(f"; mean power {power}")
-    found = reported(run)
-    powers = [found[key] * max(seconds, 1e-9) for key in ("power_net_w", "power_el_w")]
+    report = reported(run)
+    powers = [report[key] * max(seconds, 1e-9) for key in ("power_net_w", "power_el_w")]
     assert powers == pytest.approx([0.375, 4.0])
 
 
@@ -224,7 +224,7 @@ def test_json_of_a_run():
         fault=FAULT, missing=("max_rate",), cut=("a",), approach_s=NAN, path=Path("dry.mcap"),
         remarks=(GateEvent("warn", "gate: so"),), joints=(demand(current_peak=NAN), SECOND),
     )  # fmt: skip
-    found = reported(run)
+    report = reported(run)
     expected = {
         "driven": "wave.mcap", "kind": "commands", "robot": "short", "world": "nominal",
         "armed": False, "duration_s": 4.0, "planned_duration_s": 8.0, "approach_s": None,
@@ -232,16 +232,16 @@ def test_json_of_a_run():
         "energy_abs_j": 1.5, "energy_el_j": 4.0, "power_net_w": 0.09375, "power_el_w": 1.0,
         "cut": ["a"], "remarks": [{"level": "warn", "text": "gate: so"}], "path": "dry.mcap",
     }  # fmt: skip
-    assert {key: found[key] for key in expected} == expected
-    assert found["stop"] == {
+    assert {key: report[key] for key in expected} == expected
+    assert report["stop"] == {
         "time_s": 4.0, "why": "joint02: too far", "kind": "tracking", "joint": "joint02",
         "value": 0.3, "limit": 0.25,
     }  # fmt: skip
     closest = {"joint": "joint02", "quantity": "range", "limit": 0.6}
-    assert {key: found["closest"][key] for key in closest} == closest
-    assert found["closest"]["value"] == pytest.approx(0.55)
-    assert found["closest"]["share"] == pytest.approx(0.55 / 0.6)
-    first, second = found["joints"]
+    assert {key: report["closest"][key] for key in closest} == closest
+    assert report["closest"]["value"] == pytest.approx(0.55)
+    assert report["closest"]["share"] == pytest.approx(0.55 / 0.6)
+    first, second = report["joints"]
     assert (first["current_peak"], first["share"]["current"]) == (None, None)
     assert first["share"]["tracking_error"] == pytest.approx(0.2)
     assert (first["margin"], second["margin"]) == pytest.approx((0.3, 0.05))

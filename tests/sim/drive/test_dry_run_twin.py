@@ -139,13 +139,13 @@ def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
 
 def test_json_has_si_units_and_nothing_that_is_no_number(waved):
     _, run, path = waved
-    found = json.loads(json.dumps(reported(run), allow_nan=False))
-    assert (found["verdict"], found["would_run"], found["armed"]) == ("would run", True, False)
-    assert found["path"] == str(path)
-    assert found["joints"][0]["greatest"] == run.joints[0].greatest
-    assert found["joints"][0]["share"]["rate"] == run.joints[0].rate / 4.0
-    assert found["energy_net_j"] == pytest.approx(1.5 * found["power_net_w"])
-    assert found["stop"] is None
+    report = json.loads(json.dumps(reported(run), allow_nan=False))
+    assert (report["verdict"], report["would_run"], report["armed"]) == ("would run", True, False)
+    assert report["path"] == str(path)
+    assert report["joints"][0]["greatest"] == run.joints[0].greatest
+    assert report["joints"][0]["share"]["rate"] == run.joints[0].rate / 4.0
+    assert report["energy_net_j"] == pytest.approx(1.5 * report["power_net_w"])
+    assert report["stop"] is None
 
 
 def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path, opened):
@@ -206,8 +206,8 @@ def test_on_the_command_line_nothing_is_opened(tmp_path, command, report_of, ope
         assert text.startswith("weak-servo-pi3 on snake25 would run as it is; closest")
         assert "nothing was sent, and no bus opened" in text
         path = tmp_path / "dry.mcap"
-        found = report_of(*words, "-o", path)
-        assert (found["on"], found["would_run"], found["path"]) == (on, True, str(path))
+        report = report_of(*words, "-o", path)
+        assert (report["on"], report["would_run"], report["path"]) == (on, True, str(path))
         with pytest.raises(BlockingIOError):
             server.accept()
     assert opened(path).metadata["undulog"]["dry_run"] == "yes"

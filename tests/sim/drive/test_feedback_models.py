@@ -133,10 +133,10 @@ def test_requests_pauses_and_bounds_are_those_of_a_plain_count(joints):
             at_ms = now[0] - chance.choice([0, 1, 4, 5, 6, 9])
             count.receive(np.array(replies), at_ms * MS)
             model.receive(replies, at_ms)
-            expected, found = model.bounds(now[0], rate), count.bounds()
-            assert (found is None) == (expected is None), (seed, tick)
+            expected, bounds = model.bounds(now[0], rate), count.bounds()
+            assert (bounds is None) == (expected is None), (seed, tick)
             if expected is not None:
-                assert np.abs(np.subtract(found, expected)).max() < 1e-12, (seed, tick)
+                assert np.abs(np.subtract(bounds, expected)).max() < 1e-12, (seed, tick)
             if tick >= 12 and len(model.commands) < 5 and chance.random() < 0.8:
                 command = np.array([chance.uniform(-0.5, 0.5) for _ in range(joints)])
                 pose = np.zeros(joints)
@@ -180,18 +180,18 @@ def test_the_share_of_a_command_falls_by_a_fifth_and_grows_by_a_fiftieth():
     chance, limit = random.Random(4), [1.0, 0.5, float("nan"), 2.0]
     limiter, shares = CurrentLimiter(np.array(limit)), [1.0] * 4
     for _ in range(120):
-        wanted, angle = ([chance.uniform(-1, 1) for _ in limit] for _ in range(2))
+        commands, angle = ([chance.uniform(-1, 1) for _ in limit] for _ in range(2))
         current = [chance.choice([-1.0, 1.0]) * chance.choice([0.4, 1.0, 1.01, 3.0]) for _ in limit]
         if chance.random() < 0.2:
             angle[chance.randrange(4)] = float("nan")
             current[chance.randrange(4)] = float("nan")
-        found = limiter.apply(*map(np.array, (wanted, angle, current)))
+        limited = limiter.apply(*map(np.array, (commands, angle, current)))
         for joint, most in enumerate(limit):
             beyond = abs(current[joint]) > most
             share = shares[joint] * 0.8 if beyond else min(1.0, shares[joint] + 0.02)
             shares[joint] = share
-            at, to = angle[joint], wanted[joint]
+            at, to = angle[joint], commands[joint]
             expected = to if share == 1.0 or np.isnan(at) else at + share * (to - at)
-            assert found[joint] == pytest.approx(expected, abs=1e-12)
+            assert limited[joint] == pytest.approx(expected, abs=1e-12)
         assert limiter.yields.tolist() == [share < 1.0 for share in shares]
     assert min(shares[:2]) < 1.0 == shares[2]

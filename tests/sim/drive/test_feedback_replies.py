@@ -168,7 +168,10 @@ def test_what_another_joint_answered_the_bus_had_before():
 
 def test_a_command_bounds_the_next_ones_until_a_reply_to_a_later_request():
     line = Line(joints=2, armed=(1, 3, 99))
-    count, commands = line.count, [np.array(one) for one in ([0.3, 0.1], [0.32, 0.09], [0.35, 0.1])]
+    count, commands = (
+        line.count,
+        [np.array(angles) for angles in ([0.3, 0.1], [0.32, 0.09], [0.35, 0.1])],
+    )
     pose, step = np.array([0.28, 0.11]), RATE * PERIOD_S
     assert count.bounds() is None
 

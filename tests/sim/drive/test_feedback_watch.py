@@ -94,11 +94,11 @@ def test_ticks_that_did_not_take_place_or_expect_nothing_are_no_silence():
 def status(**changed):
     """All joints well, but for some values: quantity to {joint number: value}."""
     usual = {"angle": 0.0, "current": 0.1, "temperature": 30.0, "voltage": 6.0, "silence_s": 0.01}
-    found = {name: np.full(25, value) for name, value in usual.items()}
+    quantities = {name: np.full(25, value) for name, value in usual.items()}
     for name, values in changed.items():
         for joint, value in values.items():
-            found[name][joint] = value
-    return JointStatus(**found)
+            quantities[name][joint] = value
+    return JointStatus(**quantities)
 
 
 def look(at_s, watch=None, command=None, **changed):

@@ -27,10 +27,10 @@ wishes = st.lists(arrays(np.float64, 25, elements=anything | near), min_size=1, 
 
 @settings(max_examples=60, deadline=None)
 @given(wishes, arrays(np.float64, 25, elements=st.floats(-0.6, 0.6)))
-def test_no_sequence_of_wishes_gives_a_command_beyond_a_limit_on_the_bus(wanted, pose):
+def test_no_sequence_of_wishes_gives_a_command_beyond_a_limit_on_the_bus(orders, pose):
     clamp = Clamp(LIMITS, pose, PERIOD_S)
     before = clamp.last
-    for wish in wanted:
+    for wish in orders:
         command = clamp.apply(wish).command
         sent = on_the_bus(command)
         assert (sent >= np.radians(-30) - 1e-9).all()
@@ -43,20 +43,20 @@ def test_no_sequence_of_wishes_gives_a_command_beyond_a_limit_on_the_bus(wanted,
 def test_what_is_within_the_limits_passes_bit_by_bit():
     clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
     for k in range(200):
-        wanted = 0.4 * np.sin(np.pi * k * PERIOD_S + np.arange(25)) * min(k / 100, 1.0)
-        np.testing.assert_array_equal(clamp.apply(wanted).command, wanted)
+        wish = 0.4 * np.sin(np.pi * k * PERIOD_S + np.arange(25)) * min(k / 100, 1.0)
+        np.testing.assert_array_equal(clamp.apply(wish).command, wish)
     assert clamp.cuts == {"by_position": 0, "by_rate": 0, "unconfirmed": 0, "not_finite": 0}
 
 
 def test_cuts_are_reported_by_joint_and_reason():
     clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
-    wanted = np.zeros(25)
-    wanted[[3, 4, 5]] = 1.0, 0.3, np.nan
-    found = clamp.apply(wanted)
-    assert np.flatnonzero(found.by_position).tolist() == [3]
-    assert np.flatnonzero(found.by_rate).tolist() == [3, 4]
-    assert np.flatnonzero(found.not_finite).tolist() == [5]
-    assert found.command[[3, 4, 5]].tolist() == [0.04, 0.04, 0.0]
+    wish = np.zeros(25)
+    wish[[3, 4, 5]] = 1.0, 0.3, np.nan
+    clamped = clamp.apply(wish)
+    assert np.flatnonzero(clamped.by_position).tolist() == [3]
+    assert np.flatnonzero(clamped.by_rate).tolist() == [3, 4]
+    assert np.flatnonzero(clamped.not_finite).tolist() == [5]
+    assert clamped.command[[3, 4, 5]].tolist() == [0.04, 0.04, 0.0]
     assert clamp.cuts == {"by_position": 1, "by_rate": 2, "unconfirmed": 0, "not_finite": 1}
 
 
@@ -75,7 +75,7 @@ def test_a_ramp_arrives_and_no_joint_is_faster_than_it_may(start, target, rate):
     np.testing.assert_array_equal(ramp.at(0.0), start if ramp.duration_s else ramp.at(0.0))
     np.testing.assert_allclose(ramp.at(ramp.duration_s), target, atol=1e-15)
     t = np.linspace(0.0, ramp.duration_s, 500)
-    step = np.abs(np.diff(np.array([ramp.at(each) for each in t]), axis=0)).max(axis=0)
+    step = np.abs(np.diff(np.array([ramp.at(instant) for instant in t]), axis=0)).max(axis=0)
     rounding = np.spacing(np.maximum(np.abs(start), np.abs(target)))  # of the angles themselves
     assert (step <= rate * (1 + 1e-6) * t[1] + rounding).all()
 
@@ -101,11 +101,11 @@ def test_an_ending_starts_where_the_joints_are(how):
 
 def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
     yielding = CurrentLimiter(np.array([1.0, 1.0, np.nan]))
-    wanted, angle = np.array([0.3, 0.3, 0.3]), np.array([0.1, 0.1, np.nan])
+    wish, angle = np.array([0.3, 0.3, 0.3]), np.array([0.1, 0.1, np.nan])
     current = np.array([8.0 * 0.2, 0.5, 5.0])  # of a stiff servo: proportional to the distance
     pushed = []
     for _ in range(40):
-        command = yielding.apply(wanted, angle, current)
+        command = yielding.apply(wish, angle, current)
         current[0] = 8.0 * (command[0] - angle[0])
         pushed.append(current[0])
     assert max(pushed[3:]) <= 1.0 * 1.05  # it grows back until the limit is met again

@@ -90,8 +90,8 @@ def check_told(err, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
     assert err.startswith(f"error: the disk at {disk} is full or fails: {path}")
     assert "; the joints were brought straight within " in err
     assert not (path.parent / f"{path.name}.wal").exists()
-    found = check_session(path).file
-    assert (found.indexed, found.damage) == (True, ())
+    file = check_session(path).file
+    assert (file.indexed, file.damage) == (True, ())
     written = Written(path)
     gate_stage.check_ramp_down(written, "fault: the disk at ", ramp_rate=ramp_rate)
     health = written.metadata["undulog.health"]

@@ -31,8 +31,8 @@ def errors(written):
 
 def check_told(written, reason):
     """The fault is reported when it is found and at the end, and no other one is."""
-    found, end = errors(written)
-    assert found.startswith(f"fault: {reason}")
+    first, end = errors(written)
+    assert first.startswith(f"fault: {reason}")
     assert end.startswith(f"fault: {reason}")
     assert written.metadata["undulog.health"]["verdict"] == "bad"
     assert json.loads(written.metadata["undulog.health"]["reasons"])[0].startswith(reason)
@@ -135,7 +135,7 @@ def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driv
     assert any("command held back to 4 rad/s" in text for _, _, text in written.notes)
     given = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
     skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.notes]
-    counts = [1 if found[1] == "a" else int(found[1]) for found in skipped if found]
+    counts = [1 if match[1] == "a" else int(match[1]) for match in skipped if match]
     assert sum(counts) <= int(given[1]) >= 4 * 25
 
 
@@ -196,7 +196,7 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(dri
     database = folder / "snake25.dbc"
     moved = re.sub(  # messages and the names of their values, to other identifiers
         r"^((?:BO|VAL)_ )(\d+)",
-        lambda found: f"{found[1]}{int(found[2]) + 1024}",
+        lambda match: f"{match[1]}{int(match[2]) + 1024}",
         database.read_text(),
         flags=re.MULTILINE,
     )

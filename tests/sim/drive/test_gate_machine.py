@@ -183,8 +183,8 @@ def test_what_goes_wrong_while_it_ends_is_reported_once_and_ends_nothing_twice()
 def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
     bench = Bench(duration_s=60.0, listen_s=0.5).running(50)
     sent, last = len(bench.sent), bench.sent[-1]
-    found = [bench.step(received=False) for _ in range(200)]
-    assert [step.command is not None for step in found] == [True] * 2 + [False] * 198
+    steps = [bench.step(received=False) for _ in range(200)]
+    assert [step.command is not None for step in steps] == [True] * 2 + [False] * 198
     assert bench.gate.phase is GatePhase.HOLD
     assert np.abs(bench.sent[-1] - last).max() <= 2 * 4.0 / RATE_HZ
     bench.until(GatePhase.DONE)
@@ -272,9 +272,12 @@ def test_who_is_on_the_bus():
 def test_lateness_is_summed_up_as_numpy_has_it():
     assert jitter([]) is None
     late = np.random.default_rng(3).exponential(2e-3, 5000)
-    found = jitter(late.tolist())
-    assert found.median_s == pytest.approx(np.median(late))
-    assert (found.p99_s, found.worst_s) == (pytest.approx(np.percentile(late, 99)), late.max())
-    assert sum(found.counts) == 5000
-    assert found.counts[3] == ((late > 0.5e-3) & (late <= 1e-3)).sum()
-    assert list(found.to_dict()["counts"])[3] == "<= 1 ms"
+    lateness = jitter(late.tolist())
+    assert lateness.median_s == pytest.approx(np.median(late))
+    assert (lateness.p99_s, lateness.worst_s) == (
+        pytest.approx(np.percentile(late, 99)),
+        late.max(),
+    )
+    assert sum(lateness.counts) == 5000
+    assert lateness.counts[3] == ((late > 0.5e-3) & (late <= 1e-3)).sum()
+    assert list(lateness.to_dict()["counts"])[3] == "<= 1 ms"

@@ -45,11 +45,11 @@ sys.exit(undulog.run(sys.argv[1:]))
 @contextmanager
 def running_far_end(*words):
     """One process, and its port."""
-    with start(sys.executable, far_end.__file__, *words, stdin=PIPE, stderr=None) as one:
+    with start(sys.executable, far_end.__file__, *words, stdin=PIPE, stderr=None) as far_process:
         try:
-            yield one, int(one.stdout.readline())
+            yield far_process, int(far_process.stdout.readline())
         finally:
-            one.kill()
+            far_process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +92,8 @@ class Drive:
         self.route("hold none")
         time.sleep(0.3)
         self.robot.stdin.close()
-        found = json.loads(self.robot.stdout.readline())
-        self.arrivals, self.pause_s = found["arrivals"], found["pause_s"]
+        report = json.loads(self.robot.stdout.readline())
+        self.arrivals, self.pause_s = report["arrivals"], report["pause_s"]
         self.burst = largest_burst(self.arrivals)
         self.beyond = beyond_rate(self.arrivals, MAX_RATE, PERIOD_S)
         with Session.open(self.path) as session:
@@ -191,11 +191,11 @@ WAYS = {
 @pytest.mark.parametrize("way", cases(WAYS, {"up, down", "late", "late bursts"}))
 def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
     with driving(folder, tmp_path, "polled", duration_s=4.0) as drive:
-        for each in way:
-            if isinstance(each, str):
-                drive.route(each)
+        for part in way:
+            if isinstance(part, str):
+                drive.route(part)
             else:
-                time.sleep(each)
+                time.sleep(part)
         drive.end()
     drive.check_bound()
 

@@ -76,10 +76,10 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
         gait.wish = wish
         status = JointStatus(angle, current, unknown, unknown, np.zeros(COUNT))
         received = GateInput(Readings(angle, unknown), status, **more)
-        found = gate.step(tick, received, stop, at_once=at_once)
+        step = gate.step(tick, received, stop, at_once=at_once)
         tick += 1
-        if found.command is not None:
-            sent.append(on_the_bus(found.command))
+        if step.command is not None:
+            sent.append(on_the_bus(step.command))
 
     gate.silence.interval = 1
     try:

@@ -17,13 +17,13 @@ from undulog.sim.drive.motion import MotionSource
 def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
     robot = make_robot(5, planar=True)
     wave = sim.Serpentine({Plane.HORIZONTAL: sim.PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
-    own, faded = (
+    full, faded = (
         sim.SerpentineGait(wave, robot),
         FadingGait(sim.SerpentineGait(wave, robot), robot, 0.5),
     )
     nothing = sim.Readings.nothing(robot)
     for k in range(160):  # whatever the rounding of times: 0.5 s are 50 ticks
-        expected, tick = own.step(k / 100, nothing), faded.step(k / 100, nothing)
+        expected, tick = full.step(k / 100, nothing), faded.step(k / 100, nothing)
         if k == 99:
             faded.begin()
         x = min(max((k - 100) / 50, 0.0), 1.0)
@@ -100,11 +100,11 @@ def waving(make_scenario, make_robot, duration_s):
 def test_a_drive_ends_at_its_time_and_calls_with_each_sample(make_scenario, make_robot, tmp_path):
     driven, scenario = waving(make_scenario, make_robot, 0.05)
     seen, path = [], tmp_path / "a.mcap"
-    found = drive_twin(driven, scenario, path, stop=StopRequest(), on_sample=seen.append)
-    assert (found.path, found.complete, found.sample_count) == (path, True, 6)
+    result = drive_twin(driven, scenario, path, stop=StopRequest(), on_sample=seen.append)
+    assert (result.path, result.complete, result.sample_count) == (path, True, 6)
     assert [sample.tick for sample in seen] == list(range(6))
     again = drive_twin(driven, scenario, path, force=True)
-    assert (again.complete, again.session_id) == (True, found.session_id)
+    assert (again.complete, again.session_id) == (True, result.session_id)
     with pytest.raises(FileExistsError):
         drive_twin(driven, scenario, path)
     with Session.open(path) as session:
@@ -121,9 +121,9 @@ def test_asked_to_stop_a_drive_goes_on_until_it_is_at_rest(make_scenario, make_r
         if sample.tick == 3:
             stop.signal = signal.SIGTERM
 
-    found = drive_twin(driven, scenario, tmp_path / "a.mcap", stop=stop, on_sample=on_sample)
+    result = drive_twin(driven, scenario, tmp_path / "a.mcap", stop=stop, on_sample=on_sample)
     # From the step after that sample on it fades, for 100 steps; then it is held.
-    assert (found.complete, found.sample_count) == (False, 4 + 101)
+    assert (result.complete, result.sample_count) == (False, 4 + 101)
     with Session.open(tmp_path / "a.mcap") as session:
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
         commands = np.array(session.joints("/joint_commands").values)

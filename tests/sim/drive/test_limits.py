@@ -73,14 +73,14 @@ def test_limits_of_what_the_bus_tells_are_needed_and_others_are_not():
         dataclasses.replace(signal, quantity="voltage") if signal.direction == "tx" else signal
         for signal in ROBOT.bus.signals
     ]
-    told = dataclasses.replace(ROBOT.bus, signals=tuple(commanded))
-    assert "min_voltage" not in missing_limits(dataclasses.replace(ROBOT, bus=told))
+    bus = dataclasses.replace(ROBOT.bus, signals=tuple(commanded))
+    assert "min_voltage" not in missing_limits(dataclasses.replace(ROBOT, bus=bus))
 
 
 def test_an_example_is_a_table_that_can_be_read():
-    found = tomllib.loads(safety_example((*ALWAYS, "min_voltage")))
-    assert list(found["safety"]) == [*ALWAYS, "min_voltage"]
-    assert all(value > 0.0 for value in found["safety"].values())
+    table = tomllib.loads(safety_example((*ALWAYS, "min_voltage")))
+    assert list(table["safety"]) == [*ALWAYS, "min_voltage"]
+    assert all(value > 0.0 for value in table["safety"].values())
     assert safety_example(()) == "[safety]"
 
 
@@ -88,17 +88,17 @@ def test_the_limits_are_those_of_the_description():
     values = {name: 0.1 * (k + 1) for k, name in enumerate(ALWAYS)}
     values |= {"max_current": 2.0, "max_temperature": 55.0, "min_voltage": 6.5}
     safety = Safety(**values, fault_after_s=0.7, on_fault=OnFault.HOLD)
-    found = gate_limits(dataclasses.replace(ROBOT, safety=safety))
+    of_robot = gate_limits(dataclasses.replace(ROBOT, safety=safety))
     for name, value in (
         ("rate", 0.1), ("ramp_rate", 0.1), ("tracking_error", 0.3), ("current", 2.0),
         ("temperature", 55.0), ("voltage", 6.5),
     ):  # fmt: skip
-        np.testing.assert_allclose(getattr(found, name), np.full(25, value), err_msg=name)
-    assert (found.reply_timeout_s, found.late_s) == (0.4, 0.5)
-    assert (found.fault_after_s, found.on_fault) == (0.7, OnFault.HOLD)
-    assert found.joint_names == ROBOT.joint_names
-    np.testing.assert_array_equal(found.lower, [joint.lower for joint in ROBOT.joints])
-    np.testing.assert_array_equal(found.upper, [joint.upper for joint in ROBOT.joints])
+        np.testing.assert_allclose(getattr(of_robot, name), np.full(25, value), err_msg=name)
+    assert (of_robot.reply_timeout_s, of_robot.late_s) == (0.4, 0.5)
+    assert (of_robot.fault_after_s, of_robot.on_fault) == (0.7, OnFault.HOLD)
+    assert of_robot.joint_names == ROBOT.joint_names
+    np.testing.assert_array_equal(of_robot.lower, [joint.lower for joint in ROBOT.joints])
+    np.testing.assert_array_equal(of_robot.upper, [joint.upper for joint in ROBOT.joints])
     with pytest.raises(UsageError) as refused:
         gate_limits(dataclasses.replace(ROBOT, safety=dataclasses.replace(safety, max_late_s=None)))
     assert str(refused.value).startswith(
@@ -125,12 +125,12 @@ def test_a_command_waits_for_the_joint_that_needs_longest():
     assert spacing.earliest_ns(np.array([9.0, 9.0]), 3).tolist() == [0, 0, 0]
     spacing.sent(np.array([0.0, 0.1]), np.array([1000, 1001, 1003]) * MS)
     # 0.02 rad at 2 rad/s are 10 ms, 0.03 rad at 4 rad/s are 7.5 ms.
-    found = spacing.earliest_ns(np.array([-0.03, 0.08]), 3)
-    assert found.tolist() == pytest.approx(np.array([1010, 1011, 1013]) * MS, abs=1)
+    earliest_ns = spacing.earliest_ns(np.array([-0.03, 0.08]), 3)
+    assert earliest_ns.tolist() == pytest.approx(np.array([1010, 1011, 1013]) * MS, abs=1)
     assert (spacing.waits, spacing.longest_s) == (1, pytest.approx(0.013))
     now_ns = 1006 * MS
-    found = spacing.earliest_ns(np.array([0.0, 0.11]), 2)  # other frames: after all of those
-    assert found.tolist() == pytest.approx([1008 * MS] * 2, abs=1)
+    earliest_ns = spacing.earliest_ns(np.array([0.0, 0.11]), 2)  # other frames: after all of those
+    assert earliest_ns.tolist() == pytest.approx([1008 * MS] * 2, abs=1)
     assert (spacing.waits, spacing.longest_s) == (2, pytest.approx(0.013))
     now_ns = 1013 * MS + 1
     assert spacing.earliest_ns(np.array([-0.03, 0.08]), 3).max() <= now_ns
@@ -154,19 +154,19 @@ def test_a_clamp_measures_its_steps_from_the_command_before():
     clamp = Clamp(limits(), np.array([0.0, 0.6, -2.0]), 0.01)
     np.testing.assert_array_equal(clamp.last, [0.0, 0.5, -1.0])  # the pose, within its limits
     least, most = np.full(3, -0.01), np.full(3, 0.02)
-    found = clamp.apply(np.array([1.5, -9.0, -1.0]), (least, most))
+    clamped = clamp.apply(np.array([1.5, -9.0, -1.0]), (least, most))
     # The step is 0.04, 0.02, 0.01 rad; a bound is no tighter than the last command.
-    np.testing.assert_allclose(found.command, [0.02, 0.48, -1.0])
-    assert found.by_position.tolist() == [True, True, False]
-    assert found.by_rate.tolist() == [True, True, False]
-    assert found.unconfirmed.tolist() == [True, False, False]
-    assert not found.not_finite.any()
-    found.command[:] = 7.0
+    np.testing.assert_allclose(clamped.command, [0.02, 0.48, -1.0])
+    assert clamped.by_position.tolist() == [True, True, False]
+    assert clamped.by_rate.tolist() == [True, True, False]
+    assert clamped.unconfirmed.tolist() == [True, False, False]
+    assert not clamped.not_finite.any()
+    clamped.command[:] = 7.0
     np.testing.assert_allclose(clamp.last, [0.02, 0.48, -1.0])
-    found = clamp.apply(np.array([np.inf, np.nan, -np.inf]))
-    np.testing.assert_allclose(found.command, [0.02, 0.48, -1.0])
-    assert found.not_finite.all()
-    assert not (found.by_position | found.by_rate | found.unconfirmed).any()
+    clamped = clamp.apply(np.array([np.inf, np.nan, -np.inf]))
+    np.testing.assert_allclose(clamped.command, [0.02, 0.48, -1.0])
+    assert clamped.not_finite.all()
+    assert not (clamped.by_position | clamped.by_rate | clamped.unconfirmed).any()
     assert clamp.cuts == {"by_position": 2, "by_rate": 2, "unconfirmed": 1, "not_finite": 3}
     tiny = clamp.apply(np.array([0.02 + 4e-2 + 9e-13, 0.48, -1.0 - 9e-13]))  # its last bits
     assert not (tiny.by_position | tiny.by_rate | tiny.unconfirmed).any()

@@ -38,25 +38,25 @@ def test_a_clamp_is_that_of_a_plain_one_joint_by_joint():
         assert clamp.last.tolist() == last
         for _ in range(25):
             wild = [0.0, 0.004, 0.02, -0.03, 9.0, -9.0, math.nan, math.inf, -math.inf]
-            wanted = [angle + chance.choice(wild) for angle in last]
+            wishes = [angle + chance.choice(wild) for angle in last]
             spread = [(chance.uniform(0, 0.05), chance.uniform(-0.01, 0.05)) for _ in last]
             bounds = [(angle - a, angle + b) for angle, (a, b) in zip(last, spread, strict=True)]
             bounded = chance.random() < 0.7
             given = tuple(np.array(bounds).T) if bounded else None
-            found = clamp.apply(np.array(wanted), given)
+            clamped = clamp.apply(np.array(wishes), given)
             for k, rate in enumerate(RATE):
-                finite, before = math.isfinite(wanted[k]), last[k]
-                inside = within(wanted[k] if finite else before, LOWER[k], UPPER[k])
+                finite, before = math.isfinite(wishes[k]), last[k]
+                inside = within(wishes[k] if finite else before, LOWER[k], UPPER[k])
                 reached = within(inside, before - rate * period_s, before + rate * period_s)
                 least, most = bounds[k] if bounded else (-math.inf, math.inf)
                 last[k] = within(reached, min(least, before), max(most, before))
                 changes = (
-                    finite and abs(inside - wanted[k]) > 1e-12, abs(inside - reached) > 1e-12,
+                    finite and abs(inside - wishes[k]) > 1e-12, abs(inside - reached) > 1e-12,
                     abs(reached - last[k]) > 1e-12, not finite,
                 )  # fmt: skip
-                assert found.command[k] == clamp.last[k] == last[k]
+                assert clamped.command[k] == clamp.last[k] == last[k]
                 for reason, changed in zip(REASONS, changes, strict=True):
-                    assert getattr(found, reason)[k] == changed, (reason, k)
+                    assert getattr(clamped, reason)[k] == changed, (reason, k)
                     cuts[reason] += changed
             assert clamp.cuts == cuts
         assert min(cuts.values()) > 0
@@ -75,7 +75,7 @@ def test_frames_wait_for_as_long_as_the_slowest_joint_needs():
                 [chance.randrange(-20, 20) * 2**-10 for _ in RATE],
                 chance.choice([3, 3, 2]),
             )
-            found = spacing.earliest_ns(np.array(command), count).tolist()
+            earliest_ns = spacing.earliest_ns(np.array(command), count).tolist()
             if last is None:
                 expected = [0] * count
             else:
@@ -88,11 +88,11 @@ def test_frames_wait_for_as_long_as_the_slowest_joint_needs():
                 expected = [at_ns + need_ns for at_ns in before]
                 if max(expected) > now_ns:
                     waits, longest = waits + 1, max(longest, Fraction(max(expected) - now_ns, NS))
-            assert found == expected
+            assert earliest_ns == expected
             assert (spacing.waits, spacing.longest_s) == (waits, pytest.approx(float(longest)))
             if chance.random() < 0.8:
                 last = command
-                sent_ns = [max(now_ns, at_ns) + k for k, at_ns in enumerate(found)]
+                sent_ns = [max(now_ns, at_ns) + k for k, at_ns in enumerate(earliest_ns)]
                 spacing.sent(np.array(command), np.array(sent_ns))
         assert waits > 0
 
@@ -120,8 +120,8 @@ def test_an_ending_is_a_ramp_from_where_each_joint_is_to_its_rest(how):
             x = min(share, 1.0)
             smooth = 3 * x**2 - 2 * x**3
             expected = [a + smooth * (b - a) for a, b in zip(starts, rests, strict=True)]
-            found = ending.at(share * 1.5 * max(ways))
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+            angles = ending.at(share * 1.5 * max(ways))
+            np.testing.assert_allclose(angles, expected, rtol=0, atol=1e-12)
 
 
 def test_a_ramp_is_steepest_in_its_middle_where_the_slowest_joint_has_its_rate():

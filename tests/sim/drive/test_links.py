@@ -34,9 +34,9 @@ def test_ticks_and_frames_stay_in_order_however_the_stream_is_cut(cut):
         link = find_virtual_robot(parse_address(on), Tally(lambda: 0))
         try:
             assert (link.robot_name, link.lockstep) == ("snake25", True)
-            found = [link.wait_tick(5.0) for _ in range(3)]
-            assert [tick for tick, _ in found] == [0, 1, 2]
-            assert [identifiers(frames) for _, frames in found] == [[], [], [0x201, 0x202]]
+            ticks = [link.wait_tick(5.0) for _ in range(3)]
+            assert [tick for tick, _ in ticks] == [0, 1, 2]
+            assert [identifiers(frames) for _, frames in ticks] == [[], [], [0x201, 0x202]]
             assert link.wait_tick(0.05) is None
             wait_for(lambda: identifiers(link.receive()) == [0x203], "the frame without a tick")
         finally:

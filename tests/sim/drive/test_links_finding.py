@@ -45,8 +45,8 @@ class Server:
         self.pending += answer
 
     def recv(self, size):
-        found, self.pending = self.pending[:size], self.pending[size:]
-        return found
+        piece, self.pending = self.pending[:size], self.pending[size:]
+        return piece
 
     def settimeout(self, seconds):
         self.timeouts.append(seconds)
@@ -173,9 +173,13 @@ def test_ticks_that_came_before_go_on_counting_their_own_frames(monkeypatch):
     server = Server()
     link = VirtualRobotLink("can:here", server, b"", **more)
     chunks = (b"< frame %d 1.0 0%d >" % (200 + k, k) for k in range(1, 7))
-    one, two, three, four, five, six = chunks
+    first, second, third, fourth, fifth, sixth = chunks
     monkeypatch.setattr(links, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
-    pieces = [one, two + b"< tick 1 >" + three, b"< tick 2 >< tick 3 >" + four + five + six]
+    pieces = [
+        first,
+        second + b"< tick 1 >" + third,
+        b"< tick 2 >< tick 3 >" + fourth + fifth + sixth,
+    ]
     monkeypatch.setattr(server, "recv", lambda size: pieces.pop(0))
     for _ in range(3):
         link._read()
@@ -193,23 +197,23 @@ def test_ticks_that_came_before_go_on_counting_their_own_frames(monkeypatch):
 def test_the_age_of_each_value_is_its_own():
     """At the greatest age a value is known, a moment later it is not; each has its own time."""
     robot = load_robot("snake25")
-    encode, known = BusEncoder(robot, Direction.RX).encode, BusReadings(robot)  # 0.5 s
+    encode, bus_readings = BusEncoder(robot, Direction.RX).encode, BusReadings(robot)  # 0.5 s
     values = {("joint01", Quantity.POSITION, ""): 0.1, ("ir01", Quantity.RANGE, ""): 0.25}
     values["joint01", Quantity.VELOCITY, ""] = 0.5
     values |= {("accelerometer", Quantity.ACCELERATION, axis): 1.0 for axis in "xyz"}
-    known.add(encode(values), 1.0)
-    known.add(encode({("joint02", Quantity.POSITION, ""): 0.2}), 1.25)
+    bus_readings.add(encode(values), 1.0)
+    bus_readings.add(encode({("joint02", Quantity.POSITION, ""): 0.2}), 1.25)
     for now_s, first, second in ((1.5, True, True), (1.5001, False, True), (1.7501, False, False)):
-        found, status = known.readings(now_s), known.status(now_s)
-        for angle in (found.angle, status.angle):
+        readings, status = bus_readings.readings(now_s), bus_readings.status(now_s)
+        for angle in (readings.angle, status.angle):
             assert (~np.isnan(angle[:3])).tolist() == [first, second, False]
-        assert np.isfinite(found.velocity[0]) == first
-        assert set(found.ranges) == ({"ir01"} if first else set())
-        assert set(found.acceleration) == ({"accelerometer"} if first else set())
-        assert found.magnetic_field == {}
+        assert np.isfinite(readings.velocity[0]) == first
+        assert set(readings.ranges) == ({"ir01"} if first else set())
+        assert set(readings.acceleration) == ({"accelerometer"} if first else set())
+        assert readings.magnetic_field == {}
         np.testing.assert_allclose(status.silence_s[:2], [now_s - 1.0, now_s - 1.25])
-    known.add(encode({("joint02", Quantity.POSITION, ""): 0.2}), 1.8)
-    assert known.angles[:3].tolist() == [1, 2, 0]
+    bus_readings.add(encode({("joint02", Quantity.POSITION, ""): 0.2}), 1.8)
+    assert bus_readings.angles[:3].tolist() == [1, 2, 0]
 
 
 def test_beyond_its_greatest_range_a_sensor_sees_nothing():
@@ -218,13 +222,13 @@ def test_beyond_its_greatest_range_a_sensor_sees_nothing():
     farther = dataclasses.replace(sensor, range_max=0.5)
     endless = dataclasses.replace(sensor, range_max=None)
     encode = BusEncoder(robot, Direction.RX).encode
-    for one, seen in ((farther, (0.3, 0.5, math.inf)), (endless, (0.3, 0.5, 0.7))):
-        others = tuple(one if other is sensor else other for other in robot.sensors)
-        known, found = BusReadings(dataclasses.replace(robot, sensors=others)), []
+    for modified, seen in ((farther, (0.3, 0.5, math.inf)), (endless, (0.3, 0.5, 0.7))):
+        others = tuple(modified if other is sensor else other for other in robot.sensors)
+        bus_readings, distances = BusReadings(dataclasses.replace(robot, sensors=others)), []
         for distance in (0.3, 0.5, 0.7):
-            known.add(encode({("ir01", Quantity.RANGE, ""): distance}), 1.0)
-            found.append(known.readings(1.0).ranges["ir01"])
-        assert found == pytest.approx(seen)
+            bus_readings.add(encode({("ir01", Quantity.RANGE, ""): distance}), 1.0)
+            distances.append(bus_readings.readings(1.0).ranges["ir01"])
+        assert distances == pytest.approx(seen)
 
 
 def test_a_robot_without_a_bus_map_tells_nothing():

@@ -52,13 +52,13 @@ class Servo:
     def receive(self):
         if self.lost_after is not None and len(self.taken) >= self.lost_after:
             raise SourceError(self.place, "the bus is lost")
-        found, self.answers = self.answers, []
-        if not found:
+        pending, self.answers = self.answers, []
+        if not pending:
             return []
-        frames = empty_frames(len(found))
+        frames = empty_frames(len(pending))
         frames["id_flags"], frames["dlc"], frames["dir"] = ADDRESS, 8, DIR_RX
         frames["t_host_ns"] = self.time.now_ns
-        frames["data"] = [list(data) for data in found]
+        frames["data"] = [list(data) for data in pending]
         return [frames]
 
     def send(self, frames, earliest_ns=None):
@@ -114,7 +114,7 @@ def drive(
     )
     begun_ns = time.now_ns
 
-    def each(tick):
+    def note_tick(tick):
         ticks.append(tick)
         if tick.tick == unasked_at:
             servo.answers += servo.answers[-1:]
@@ -123,7 +123,7 @@ def drive(
 
     namespace = SimpleNamespace(loop=loop, gate=gate, servo=servo, ticks=ticks, begun_ns=begun_ns)
     try:
-        loop.run(stop or StopRequest(), each, **more)
+        loop.run(stop or StopRequest(), note_tick, **more)
     except (SourceError, LogWriteError) as error:  # the tests look at both
         namespace.error = error
     return namespace

@@ -194,30 +194,30 @@ duration_s = 0.75
 def test_a_plan_gives_its_text_its_planes_and_its_scenario(tmp_path):
     path = tmp_path / "bend.toml"
     path.write_text(PLAN)
-    found, flat = find_motion(str(path)), sim.load_scenario("flat")
-    assert (found.kind, found.name, found.duration_s) == ("plan", "bend", 0.75)
-    assert (found.planes, found.robot) == ((Plane.HORIZONTAL, Plane.VERTICAL), flat.robot)
-    assert (found.world(), found.origin, found.settle_s) == (flat, None, None)
-    assert found.facts == {"driven": "plan", "driven.by": "bend"}
-    assert found.attachments == {"plan.toml": PLAN.encode()}
-    gait = found.make(ROBOT, nominal_world(ROBOT))  # it does not look at the world
+    motion, flat = find_motion(str(path)), sim.load_scenario("flat")
+    assert (motion.kind, motion.name, motion.duration_s) == ("plan", "bend", 0.75)
+    assert (motion.planes, motion.robot) == ((Plane.HORIZONTAL, Plane.VERTICAL), flat.robot)
+    assert (motion.world(), motion.origin, motion.settle_s) == (flat, None, None)
+    assert motion.facts == {"driven": "plan", "driven.by": "bend"}
+    assert motion.attachments == {"plan.toml": PLAN.encode()}
+    gait = motion.make(ROBOT, nominal_world(ROBOT))  # it does not look at the world
     assert type(gait) is PlanGait
     assert len(gait.step(0.0, sim.Readings.nothing(ROBOT)).command) == 3
 
 
 def test_a_scenarios_gait_is_that_of_the_world_it_is_driven_in():
-    found, flat = find_motion("flat"), sim.load_scenario("flat")
-    assert found.planes == tuple(flat.gait.planes)
-    world = found.scenario(sim.load_scenario("weak-servo-pi3"), None)
+    motion, flat = find_motion("flat"), sim.load_scenario("flat")
+    assert motion.planes == tuple(flat.gait.planes)
+    world = motion.scenario(sim.load_scenario("weak-servo-pi3"), None)
     faster = dataclasses.replace(flat.gait, ramp_s=0.25)
     for there in (world, dataclasses.replace(world, gait=faster)):
-        made, expected = found.make(there.robot, there), build_gait(there)
+        made, expected = motion.make(there.robot, there), build_gait(there)
         nothing = sim.Readings.nothing(there.robot)
         for time_s in (0.0, 0.3):
             np.testing.assert_array_equal(
                 made.step(time_s, nothing).command, expected.step(time_s, nothing).command
             )
-    short = found.make(ROBOT, None)  # without a world: its own, of that robot
+    short = motion.make(ROBOT, None)  # without a world: its own, of that robot
     gait = build_gait(dataclasses.replace(flat, robot=ROBOT))
     nothing = sim.Readings.nothing(ROBOT)
     for time_s in (0.0, 0.3):

@@ -83,14 +83,14 @@ def test_a_gait_goes_with_its_controller_to_another_world():
 
 
 def test_a_shipped_gait_is_found_with_its_scenario():
-    found, flat = find_motion("flat"), sim.load_scenario("flat")
-    assert (found.kind, found.name, found.origin, found.world()) == ("gait", "flat", flat, flat)
-    assert (found.duration_s, found.settle_s) == (flat.duration_s, flat.settle_s)
-    assert found.facts == {"driven": "gait", "driven.by": "flat"}
-    assert found.attachments == {"gait.toml": flat.toml().encode()}
-    assert (found.run, found.heading_rad, found.as_run, found.joints) == (0, 0.0, False, None)
-    assert found.kernels is Kernels.NUMPY
-    made = found.make(flat.robot, None)
+    motion, flat = find_motion("flat"), sim.load_scenario("flat")
+    assert (motion.kind, motion.name, motion.origin, motion.world()) == ("gait", "flat", flat, flat)
+    assert (motion.duration_s, motion.settle_s) == (flat.duration_s, flat.settle_s)
+    assert motion.facts == {"driven": "gait", "driven.by": "flat"}
+    assert motion.attachments == {"gait.toml": flat.toml().encode()}
+    assert (motion.run, motion.heading_rad, motion.as_run, motion.joints) == (0, 0.0, False, None)
+    assert motion.kernels is Kernels.NUMPY
+    made = motion.make(flat.robot, None)
     assert len(made.step(0.0, sim.Readings.nothing(flat.robot)).command) == len(flat.robot.joints)
 
 
@@ -116,4 +116,4 @@ def test_a_number_of_a_plan_that_is_none_is_refused(text, kind):
 
 def test_kernels_that_nobody_knows_are_the_usual_ones():
     assert [_kernels(name) for name in ("numpy", None, "other")] == [Kernels.NUMPY] * 3
-    assert {_kernels(str(one)) for one in Kernels} == set(Kernels)
+    assert {_kernels(str(kind)) for kind in Kernels} == set(Kernels)

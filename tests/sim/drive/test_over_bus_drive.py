@@ -153,7 +153,7 @@ def stage(tmp_path, monkeypatch):
     return stage
 
 
-def said(session):
+def events_of(session):
     """What was logged: level and text."""
     return [(message.level, message.msg) for _, message in session.messages("/rosout")]
 
@@ -169,17 +169,19 @@ def test_a_drive_in_lockstep_is_told_to_session_recorder_and_screen(stage):
     assert (report.taken, report.not_taken, link.closed) == (17, None, 1)
     assert [tick.tick for tick in seen] == list(range(21))
     assert stage.priorities == []  # it waits for each command
-    (told,) = stage.recorders
-    assert (told.path, told.names, told.closed) == (recorder, ("a", "b"), 1)
-    assert told.values == [(5 + k, "walk" if k < 8 else "turn", float(k)) for k in range(21)]
+    (publisher,) = stage.recorders
+    assert (publisher.path, publisher.names, publisher.closed) == (recorder, ("a", "b"), 1)
+    assert publisher.values == [(5 + k, "walk" if k < 8 else "turn", float(k)) for k in range(21)]
     drives = f"drives wave.mcap (commands) on {ON}"
     phases = [f"gate: {phase}" for phase in ("reading the pose", "run", "done")]
-    assert told.notes == [("info", text) for text in (drives, *phases, "drove wave.mcap for 0.2 s")]
+    assert publisher.notes == [
+        ("info", text) for text in (drives, *phases, "drove wave.mcap for 0.2 s")
+    ]
     with Session.open(stage.path) as session:
         assert session.verdict == "degraded"  # some bytes could not be read
         ends = "complete; the servos hold their last commands"
         unread = "messages of the bus that could not be read: 4"
-        assert said(session) == [
+        assert events_of(session) == [
             (20, drives), (20, phases[0]), (20, phases[1]), (30, "strange bytes (2 times)"),
             (20, phases[2]), (20, ends), (30, unread),
         ]  # fmt: skip
@@ -194,7 +196,7 @@ def test_a_drive_in_lockstep_is_told_to_session_recorder_and_screen(stage):
         assert facts["undulog.gate"]["rate"] == "4.0"
         assert "undulog.gate.jitter" not in facts
         assert "undulog.gate.feedback" not in facts
-        assert [one.data for _, one in session.messages("/gait/mode")] == ["walk", "turn"]
+        assert [message.data for _, message in session.messages("/gait/mode")] == ["walk", "turn"]
 
 
 def test_samples_that_a_recorder_did_not_take_are_told(stage):
@@ -216,16 +218,16 @@ def test_a_gait_that_fails_is_the_verdict_and_is_raised(stage):
     assert not link.angles.any()  # it came to rest before
     with Session.open(stage.path) as session:
         assert session.verdict == "bad"
-        assert said(session)[-1] == (40, "ZeroDivisionError")
+        assert events_of(session)[-1] == (40, "ZeroDivisionError")
         reasons = session.metadata["undulog.health"]["reasons"]
         assert json.loads(reasons) == ["ZeroDivisionError"]
 
 
 def test_a_disk_that_fills_ends_it_by_a_ramp(stage, monkeypatch):
-    link, told = Snake(), []
-    full = property(lambda _: "the disk is full" if len(told) > 5 else None)
+    link, ticks = Snake(), []
+    full = property(lambda _: "the disk is full" if len(ticks) > 5 else None)
     monkeypatch.setattr(BusSession, "shortage", full)
-    more = {"recorder": stage.path, "on_tick": told.append}
+    more = {"recorder": stage.path, "on_tick": ticks.append}
     report = stage.drive(link, SNAKE, Ways(25), duration_s=9.0, **more)
     assert (report.outcome.fault.kind, report.outcome.why) == (FaultKind.LOG, "the disk is full")
     assert (report.ticks, link.angles.any()) == (6, False)
@@ -279,30 +281,30 @@ class Arm:
             raise SourceError(self.place, "the bus is lost")
         if self.held[0] <= self.time.now_ns < self.held[1]:
             return []
-        found, self.answers = self.answers, []
-        frames = empty_frames(len(found))
+        pending, self.answers = self.answers, []
+        frames = empty_frames(len(pending))
         frames["id_flags"], frames["dlc"], frames["dir"] = 0x14B, 8, DIR_RX
-        if found:
-            stamps, frames["data"] = zip(*found, strict=True)
+        if pending:
+            stamps, frames["data"] = zip(*pending, strict=True)
             late = self.time.now_ns == self.held[1]
             frames["t_host_ns"] = self.time.clock.wall_ns() if late else stamps
-        return [frames] if found else []
+        return [frames] if pending else []
 
     def send(self, frames, earliest_ns=None):
-        found = []
+        times_ns = []
         for k, frame in enumerate(frames):
             if earliest_ns is not None:  # on the session's clock
                 ahead_ns = int(earliest_ns[k]) - self.time.clock.wall_ns()
                 self.time.pass_s(max(ahead_ns, 0) / NS)
-            found.append(self.time.clock.wall_ns())
+            times_ns.append(self.time.clock.wall_ns())
             if frame["data"][0] == 0xA4:
                 self.sent_ns.append(self.time.now_ns)
                 self.angle = frame["data"][4:].copy()
             else:
                 angle = int(np.frombuffer(self.angle, "<i4")[0])
                 answer = [0x92, *angle.to_bytes(7, "little", signed=True)]
-                self.answers.append((found[-1], answer))
-        return np.array(found, dtype=np.int64)
+                self.answers.append((times_ns[-1], answer))
+        return np.array(times_ns, dtype=np.int64)
 
     def close(self):
         self.closed += 1
@@ -343,7 +345,9 @@ def test_by_the_clock_it_listens_first_and_spaces_what_follows_a_late_tick(timed
     assert (facts["confirmed_by"], facts["reply_interval_s"]) == ("replies", 0.01)
     assert timed.priorities == ["raised", "lowered"]
     with Session.open(timed.path) as session:
-        lowered = [text for _, text in said(session) if text.startswith("priority was refused: ")]
+        lowered = [
+            text for _, text in events_of(session) if text.startswith("priority was refused: ")
+        ]
         assert len(lowered) == 1
         assert session.metadata["undulog.gate.feedback"] == report.feedback.facts()
         assert session.metadata["undulog.gate.jitter"]["ticks"] == "71"
@@ -364,7 +368,7 @@ def test_what_no_reply_has_confirmed_holds_the_next_command_back(timed):
     with Session.open(timed.path) as session:
         given = session.joints("/joint_commands").signal("joint01")
         np.testing.assert_allclose(given.values, expected, atol=1e-7)
-        assert not any("priority" in text for _, text in said(session))
+        assert not any("priority" in text for _, text in events_of(session))
     assert (report.cuts["by_position"], report.cuts["by_rate"]) == (0, 4)
     assert report.cuts["unconfirmed"] in {2, 3}  # a step in 10 ms may round to be late by 1 ns
     assert (report.held_s, report.feedback.by_replies) == (0.0, True)

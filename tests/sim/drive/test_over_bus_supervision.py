@@ -40,8 +40,8 @@ def test_the_reply_interval_is_told_in_seconds(every, interval):
     assert _feedback(bench.gate, LOOP) is None
     for tick in range(55):
         bench.step(received=tick % every == 0)
-    found = _feedback(bench.gate, LOOP)
-    assert found == Feedback(True, pytest.approx(interval / 100), 3 * interval, 0.01)
+    feedback = _feedback(bench.gate, LOOP)
+    assert feedback == Feedback(True, pytest.approx(interval / 100), 3 * interval, 0.01)
 
 
 def test_a_report_has_what_gate_loop_and_bus_counted():
@@ -55,14 +55,14 @@ def test_a_report_has_what_gate_loop_and_bus_counted():
         bench.step(received=tick < 60)
     counts = SourceCounts()
     counts.malformed, counts.dropped = 3, 7
-    found = _report(planned(), bench.gate, LOOP, spacing, counts)
-    assert found.outcome is bench.gate.outcome
-    assert (found.approach_s, found.gait_s, found.ticks) == (0.5, 0.11, 12)
-    assert found.held_s == pytest.approx(0.18)
-    assert (found.waits, found.longest_wait_s) == (4, 0.002)
-    assert (found.malformed, found.dropped, found.lockstep) == (3, 7, False)
-    assert (found.jitter.ticks, found.jitter.worst_s) == (2, 0.003)
-    assert found.feedback.hold_after_ticks == 3
+    report = _report(planned(), bench.gate, LOOP, spacing, counts)
+    assert report.outcome is bench.gate.outcome
+    assert (report.approach_s, report.gait_s, report.ticks) == (0.5, 0.11, 12)
+    assert report.held_s == pytest.approx(0.18)
+    assert (report.waits, report.longest_wait_s) == (4, 0.002)
+    assert (report.malformed, report.dropped, report.lockstep) == (3, 7, False)
+    assert (report.jitter.ticks, report.jitter.worst_s) == (2, 0.003)
+    assert report.feedback.hold_after_ticks == 3
     lockstep = _report(planned(), bench.gate, LOOP, None, counts)
     assert (lockstep.waits, lockstep.longest_wait_s, lockstep.lockstep) == (0, 0.0, True)
 

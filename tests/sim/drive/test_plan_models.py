@@ -72,10 +72,10 @@ def test_each_joints_values_are_those_of_the_formulas(seed, make_scenario, make_
         if tick == 60:
             gait.modulate(Modulation(factors, offsets, 1.25))
         changed = tick >= 60
-        found = gait.step(time_s, Readings.nothing(robot))
-        values = dict(zip(gait.names, found.values.tolist(), strict=True))
+        gait_tick = gait.step(time_s, Readings.nothing(robot))
+        values = dict(zip(gait.names, gait_tick.values.tolist(), strict=True))
         number = sum(begun <= time_s for begun in begun_s) - 1
-        assert (found.mode, found.clamped) == (f"part{number}", ())
+        assert (gait_tick.mode, gait_tick.clamped) == (f"part{number}", ())
         share = share_of(time_s - begun_s[number], segments[number].transition_s)
         for plane in PLANES:
             before = start[plane] if number == 0 else segments[number - 1].planes[plane]
@@ -92,10 +92,10 @@ def test_each_joints_values_are_those_of_the_formulas(seed, make_scenario, make_
                 name, phase = robot.joint_names[k], phases[plane] + place * lag
                 amplitude = a * (factors[k] if changed else 1.0)
                 offset = y + (offsets[k] if changed else 0.0)
-                told = [values[f"{name}.{key}"] for key in ("A", "offset", "phase")]
-                told += [found.command[k]]
+                reported = [values[f"{name}.{key}"] for key in ("A", "offset", "phase")]
+                reported += [gait_tick.command[k]]
                 formulas = amplitude, offset, phase, amplitude * math.sin(phase) + offset
-                assert all(abs(a - b) < 1e-9 for a, b in zip(told, formulas, strict=True))
+                assert all(abs(a - b) < 1e-9 for a, b in zip(reported, formulas, strict=True))
 
 
 def test_values_of_single_joints_are_told_where_they_are_asked_for(make_scenario, make_robot):
@@ -113,7 +113,7 @@ HEAD = 'description = "d"\nscenario = "flat"\n'
 
 
 def parts(*durations_s, more=""):
-    return "".join(f"[[segments]]\nduration_s = {one}\n{more}" for one in durations_s)
+    return "".join(f"[[segments]]\nduration_s = {duration_s}\n{more}" for duration_s in durations_s)
 
 
 def faults(text, source="p.toml"):
@@ -156,9 +156,9 @@ def test_the_scenario_is_a_shipped_one_or_a_file_beside_the_plan(tmp_path):
     plan = parse_plan(text, tmp_path / "p.toml")
     assert (plan.scenario.seed, plan.scenario.robot) == (77, flat.robot)
     assert dict(plan.start) == dict(flat.gait.planes)
-    found = faults(text, "elsewhere/p.toml")
-    assert list(found) == ["scenario"]
-    assert "a TOML file beside the plan, or one of " in found["scenario"]
+    listed = faults(text, "elsewhere/p.toml")
+    assert list(listed) == ["scenario"]
+    assert "a TOML file beside the plan, or one of " in listed["scenario"]
     assert list(faults('description = "d"\n' + parts(1.0))) == ["scenario"]
     assert list(faults(HEAD.replace("flat", "") + parts(1.0))) == ["scenario"]
     assert list(faults(HEAD.replace('"flat"', "3") + parts(1.0))) == ["scenario"]
@@ -175,8 +175,8 @@ def test_a_plane_comes_in_only_where_it_was_driven_from_the_start():
             (0.2, 0.7), (0.1, 0.5),
         ]  # fmt: skip
     assert plan.ramp_s == 0.5
-    one = parts(1.0, more="vertical = { amplitude = 0.1 }\n")
-    (segment,) = parse_plan(head + both + one, Path("p.toml")).segments
+    lone = parts(1.0, more="vertical = { amplitude = 0.1 }\n")
+    (segment,) = parse_plan(head + both + lone, Path("p.toml")).segments
     assert [plane.amplitude for plane in segment.planes.values()] == [0.2, 0.1]
     wrong = rest.replace("amplitude = 0.1", "amplitude = -0.1")
     assert list(faults(head + level.format("vertical") + wrong))[:2] == [

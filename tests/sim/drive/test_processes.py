@@ -31,17 +31,18 @@ def recorded(on, path, env):
     """A recorder of that bus, connected."""
     with process(
         *UNDULOG, "record", on, "-r", "snake25", "-o", str(path), "--floor", "0", env=env
-    ) as one:
+    ) as recorder:
 
         def connected():
             asked = undulog("record", "status", "--json", env=env)
-            found = json.loads(asked.stdout or "{}").get("recordings", [])
+            recordings = json.loads(asked.stdout or "{}").get("recordings", [])
             return any(
-                each["output"] == str(path) and each["sources"][0]["connected"] for each in found
+                recording["output"] == str(path) and recording["sources"][0]["connected"]
+                for recording in recordings
             )
 
-        wait_for(connected, "the recorder", alive=[one])
-        yield one
+        wait_for(connected, "the recorder", alive=[recorder])
+        yield recorder
 
 
 @pytest.fixture
@@ -101,12 +102,12 @@ def test_a_recorder_gets_the_gait_through_its_control_socket(tmp_path, alone):
         assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
 
 
-def held_back(wanted, most=4.0 * 0.01):
+def held_back(wishes, most=4.0 * 0.01):
     """What the gate lets through: behind ticks that a busy computer leaves out, step by step."""
-    given = np.zeros_like(wanted)  # the robot stands straight
-    for k, each in enumerate(wanted):
+    given = np.zeros_like(wishes)  # the robot stands straight
+    for k, wish in enumerate(wishes):
         before = given[k - 1] if k else 0.0
-        given[k] = np.clip(each, before - most, before + most)
+        given[k] = np.clip(wish, before - most, before + most)
     return given
 
 

@@ -179,8 +179,8 @@ def test_what_is_read_is_classic_frames_and_nothing_empty(opened):
     bus = opened.start("can:kvaser:0")
     classic = empty_frames(2)
     opened.read = [classic, empty_frames(0), empty_fd_frames(1), empty_fd_frames(0)]
-    (found,) = bus.receive()
-    assert found is classic
+    (frame,) = bus.receive()
+    assert frame is classic
     opened.read = ()
     assert list(bus.receive()) == []
 
@@ -201,14 +201,14 @@ def test_a_virtual_robot_is_looked_for_where_it_may_be(opened, monkeypatch):
     assert link("can:socketcand:can0?port=1") is robot
     assert asked == [("socketcand:can0", {"port": "1"})]
     for on in ("can:socketcand:can0?port=2", "can:socketcand:can0?port=2&plain=no"):
-        found = link(on)
-        assert (type(found), opened.driver.options["port"]) == (PythonCanBus, 2)
-        found.close()
+        bus = link(on)
+        assert (type(bus), opened.driver.options["port"]) == (PythonCanBus, 2)
+        bus.close()
         assert asked.pop() == ("socketcand:can0", {"port": "2"})
     for on in ("can:socketcand:can0?port=1&plain=yes", "can:virtual:can0"):
-        found = link(on)
-        assert type(found) is PythonCanBus
-        found.close()
+        bus = link(on)
+        assert type(bus) is PythonCanBus
+        bus.close()
         assert len(asked) == 1
     with pytest.raises(UsageError) as refused:
         link("can:socketcand")

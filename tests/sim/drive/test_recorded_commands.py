@@ -22,8 +22,10 @@ NOTHING = sim.Readings.nothing(ROBOT)
 
 def signals(topic, **series):
     """Name to {time [ms]: value}."""
-    times = tuple(START_NS + MS * np.array(list(one), dtype=np.int64) for one in series.values())
-    values = tuple(np.array(list(one.values()), dtype=float) for one in series.values())
+    times = tuple(
+        START_NS + MS * np.array(list(column), dtype=np.int64) for column in series.values()
+    )
+    values = tuple(np.array(list(column.values()), dtype=float) for column in series.values())
     return JointSignals(topic, "position", "rad", tuple(series), times, values)
 
 
@@ -33,16 +35,16 @@ def replay(gait=None, modes=(), **series):
 
 
 def test_each_joint_holds_what_was_commanded_last():
-    found = replay(joint02={4: 0.1, 20: NAN, 31: 0.3}, joint01={0: -0.1, 15: 0.2})
-    assert found.duration_s == 0.04  # 31 ms, in whole control periods
+    replayed = replay(joint02={4: 0.1, 20: NAN, 31: 0.3}, joint01={0: -0.1, 15: 0.2})
+    assert replayed.duration_s == 0.04  # 31 ms, in whole control periods
     for at_s, first, second in (
         (0.0, -0.1, 0.1), (0.014, -0.1, 0.1), (0.015, 0.2, 0.1), (0.02, 0.2, 0.1),
         (0.0309, 0.2, 0.1), (0.031, 0.2, 0.3), (99.0, 0.2, 0.3),
     ):  # fmt: skip
-        tick = found.step(at_s, NOTHING)
+        tick = replayed.step(at_s, NOTHING)
         assert tick.command.tolist() == [first, second, 0.0], at_s
         assert (tick.mode, tick.clamped, tick.values.size) == ("replay", (), 0)
-    assert found.names == ()
+    assert replayed.names == ()
 
 
 @pytest.mark.parametrize(
@@ -58,9 +60,9 @@ def test_its_length_is_in_whole_control_periods(last_ms, duration_s):
 def test_modes_and_values_are_those_of_the_time_and_may_be_unknown():
     gait = signals("/gait", A={0: 0.4, 20: NAN}, phase={10: 1.0, 30: 3.0}, none={})
     modes = ((START_NS + 10 * MS, "walk"), (START_NS + 30 * MS, "turn"))
-    found = replay(gait, modes, joint01={0: 0.0})
-    assert found.names == ("A", "phase", "none")
-    ticks = [found.step(at_s, NOTHING) for at_s in (0.0, 0.01, 0.02, 0.03)]
+    replayed = replay(gait, modes, joint01={0: 0.0})
+    assert replayed.names == ("A", "phase", "none")
+    ticks = [replayed.step(at_s, NOTHING) for at_s in (0.0, 0.01, 0.02, 0.03)]
     assert [tick.mode for tick in ticks] == ["replay", "walk", "walk", "turn"]
     values = [[0.4, 1.0, NAN], [0.4, 1.0, NAN], [NAN, 1.0, NAN], [NAN, 3.0, NAN]]
     np.testing.assert_array_equal([tick.values for tick in ticks], values)

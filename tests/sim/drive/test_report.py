@@ -31,7 +31,7 @@ def plan(tmp_path_factory):
     path = tmp_path_factory.mktemp("robot") / "chain.toml"
     safety = {"max_rate": 4.0, "ramp_rate": 1.0, "max_tracking_error": 0.3, "max_current": 1.4}
     safety |= {"max_temperature": 70.0, "reply_timeout_s": 1.0, "max_late_s": 1.5}
-    text = chain(3) + "[safety]\n" + "".join(f"{key} = {one}\n" for key, one in safety.items())
+    text = chain(3) + "[safety]\n" + "".join(f"{key} = {value}\n" for key, value in safety.items())
     path.write_text(text + 'fault_after_s = 0.5\non_fault = "hold"\n')
     robot = load_robot(path)
     driven = SimpleNamespace(name="wave.mcap", kind="commands")
@@ -96,26 +96,26 @@ def test_what_was_not_as_it_should_be_is_remarked(report):
 
 
 def test_facts_are_plain_values_with_units_in_their_names(report, plan):
-    found = report.facts()
-    assert found["real_time_factor"] == 0.5
-    assert (found["pace"], found["armed"], found["recorder"]) == ("real time", True, None)
-    assert (found["outcome"], found["why"], found["fault"]) == ("complete", None, None)
-    assert (found["duration_s"], found["planned_duration_s"], found["whole_s"]) == (5.0, 5.0, 6.5)
-    assert (found["sent"], found["received"], found["decoded"]) == (1500, 4000, 3900)
-    assert (found["feedback"], found["lateness"], found["gait_not_told"]) == (None, None, None)
-    assert (found["driven"], found["kind"], found["robot"]) == ("wave.mcap", "commands", "chain3")
+    facts = report.facts()
+    assert facts["real_time_factor"] == 0.5
+    assert (facts["pace"], facts["armed"], facts["recorder"]) == ("real time", True, None)
+    assert (facts["outcome"], facts["why"], facts["fault"]) == ("complete", None, None)
+    assert (facts["duration_s"], facts["planned_duration_s"], facts["whole_s"]) == (5.0, 5.0, 6.5)
+    assert (facts["sent"], facts["received"], facts["decoded"]) == (1500, 4000, 3900)
+    assert (facts["feedback"], facts["lateness"], facts["gait_not_told"]) == (None, None, None)
+    assert (facts["driven"], facts["kind"], facts["robot"]) == ("wave.mcap", "commands", "chain3")
     report.outcome, report.lockstep = STOPPED, True
     report.plan = dataclasses.replace(plan, recorder=Path("r.sock"))
     report.feedback = Feedback(False, 0.02, 6, 0.01)
     report.jitter, report.wall_s = jitter([0.0]), 0.0
-    found = report.facts()
-    assert (found["pace"], found["recorder"]) == ("lockstep", "r.sock")
-    assert found["fault"] == {
+    facts = report.facts()
+    assert (facts["pace"], facts["recorder"]) == ("lockstep", "r.sock")
+    assert facts["fault"] == {
         "kind": "current", "joint": "joint01", "value": 3.0, "limit": 1.4, "since_s": 2.5,
     }  # fmt: skip
-    assert found["feedback"]["most_steps"] == 7
-    assert found["lateness"]["ticks"] == 1
-    assert found["real_time_factor"] == pytest.approx(6500.0)  # of no time at all
+    assert facts["feedback"]["most_steps"] == 7
+    assert facts["lateness"]["ticks"] == 1
+    assert facts["real_time_factor"] == pytest.approx(6500.0)  # of no time at all
 
 
 def test_what_nobody_counted_is_nothing(report, plan):

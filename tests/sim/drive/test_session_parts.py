@@ -26,11 +26,11 @@ QUIET = GateStep(GatePhase.RUN, None, None, None, ())
 
 
 def frames(identifier, host_ms, device_ns=None, way=DIR_RX):
-    found = empty_frames(1)
-    found["id_flags"], found["dlc"], found["dir"] = identifier, 8, way
-    found["t_host_ns"] = EPOCH_NS + host_ms * MS
-    found["t_device_ns"] = host_ms * MS if device_ns is None else device_ns
-    return found
+    block = empty_frames(1)
+    block["id_flags"], block["dlc"], block["dir"] = identifier, 8, way
+    block["t_host_ns"] = EPOCH_NS + host_ms * MS
+    block["t_device_ns"] = host_ms * MS if device_ns is None else device_ns
+    return block
 
 
 def opened(path, **more):
@@ -96,9 +96,9 @@ def test_each_tenth_tick_decodes_and_tells_what_failed(tmp_path, monkeypatch, od
 
     monkeypatch.setattr(BusDecoder, "decode", fails)
     for number in range(1, 23):
-        one = frames(0x201, 10 * number)
-        one["data"][0, 0] = number
-        write(session, number, [one])
+        block = frames(0x201, 10 * number)
+        block["data"][0, 0] = number
+        write(session, number, [block])
     session.close()
     with Session.open(path) as log:
         t_ns, event = next(log.messages("/rosout"))
@@ -131,17 +131,17 @@ def test_an_echo_that_is_received_is_no_reading(tmp_path):
         assert [states.signal(name).t_ns.size for name in ("joint01", "joint02")] == [1, 1]
 
 
-@pytest.mark.parametrize(("beyond_ns", "known"), [(0, False), (-1, True)])
-def test_a_device_time_that_can_not_be_says_nothing_of_the_clock(tmp_path, beyond_ns, known):
+@pytest.mark.parametrize(("beyond_ns", "is_known"), [(0, False), (-1, True)])
+def test_a_device_time_that_can_not_be_says_nothing_of_the_clock(tmp_path, beyond_ns, is_known):
     session = opened(tmp_path / "a.mcap")
     device_ns = DEVICE_TIMES_END_NS + beyond_ns
     write(session, 1, [frames(0x201, 10, 4 * MS), frames(0x202, 10, device_ns)])
     write(session, 2, sent=frames(0x101, 20, way=DIR_TX))
     session.close()
     with Session.open(tmp_path / "a.mcap") as log:
-        found = log.frames("/can/one")
-        (ours,) = found[found["dir"] == DIR_TX]["t_device_ns"].astype(np.int64)
-    assert ours == (device_ns if known else 4 * MS) + 10 * MS
+        recorded = log.frames("/can/one")
+        (ours,) = recorded[recorded["dir"] == DIR_TX]["t_device_ns"].astype(np.int64)
+    assert ours == (device_ns if is_known else 4 * MS) + 10 * MS
 
 
 # -- telling a recorder -------------------------------------------------------------------------

@@ -56,7 +56,9 @@ def test_everything_is_published_in_order(tmp_path):
     gait = [request for request in received if request["do"] == "gait"]
     assert [request["t_ns"] - 10**18 for request in gait] == list(range(300))
     assert gait[7]["values"] == dict(zip(NAMES, [7.0, 8.0, 9.0, 10.0, 11.0], strict=True))
-    assert [(received.index(one), one) for one in received if one["do"] != "gait"] == [
+    assert [
+        (received.index(message), message) for message in received if message["do"] != "gait"
+    ] == [
         (0, {"do": "note", "text": "drives", "level": "info"}),
         (1, {"do": "mode", "text": "walk"}),
         (202, {"do": "mode", "text": "avoid"}),

@@ -43,14 +43,14 @@ def test_wherever_the_stream_is_cut_ticks_have_the_frames_before_them():
         rest = b"< tick 9 >" + STREAM[: cut // 2]  # what came with the answer before
         link = VirtualRobotLink("can:test", ours, rest, Tally(lambda: 0), "snake25", lockstep=True)
         with robot:
-            found = []
+            decoded = []
             for piece in (STREAM[cut // 2 : cut], STREAM[cut:]):
                 robot.sendall(piece or b" ")
                 link._read()
                 while link._ticks:
                     tick, frames = link.wait_tick(5.0)
-                    found.append((tick, identifiers(frames)))
-            assert found == [(9, []), (0, []), (1, []), (2, [0x201, 0x202]), (13, [0x203])], cut
+                    decoded.append((tick, identifiers(frames)))
+            assert decoded == [(9, []), (0, []), (1, []), (2, [0x201, 0x202]), (13, [0x203])], cut
             assert identifiers(link.receive()) == [0x204]
         link.close()
 

@@ -35,10 +35,10 @@ def test_at_constant_omega_it_is_equation_2_with_the_lag_omega_tau(make_robot, w
     equal = PlaneGait(0.3, 0.5, OMEGA * TAU, wave, offset=0.05, phase=first)
     serpentine = SerpentineGait(Serpentine({Plane.HORIZONTAL: equal}, 0.0), robot)
     for k in range(601):
-        one, other = (gait.step(k / 100, NOTHING) for gait in (delayed, serpentine))
+        tick, other = (gait.step(k / 100, NOTHING) for gait in (delayed, serpentine))
         if k >= 201:  # the longest delay is 2 s
-            np.testing.assert_allclose(one.command, other.command, atol=1e-13)
-            np.testing.assert_allclose(one.values[:4], other.values[:4], atol=1e-13)
+            np.testing.assert_allclose(tick.command, other.command, atol=1e-13)
+            np.testing.assert_allclose(tick.values[:4], other.values[:4], atol=1e-13)
 
 
 def test_before_its_delay_is_over_a_joint_rests(make_robot):
@@ -69,19 +69,19 @@ def test_a_change_of_omega_arrives_late_where_equation_2_changes_at_once(make_ro
         if k == 400:
             for gait in (delayed, serpentine):
                 gait.modulate(faster(robot, 2.0))
-        one, other = (gait.step(t, NOTHING).command[YAW] for gait in (delayed, serpentine))
+        late, other = (gait.step(t, NOTHING).command[YAW] for gait in (delayed, serpentine))
         then = t - TAU * np.arange(13)
         phase = np.where(then < 4.0, OMEGA * then, OMEGA * (4.0 + 2.0 * (then - 4.0)))
         if k >= 201:
-            np.testing.assert_allclose(one, 0.3 * np.sin(phase), atol=1e-12)
-            differences.append(np.abs(one - other))
+            np.testing.assert_allclose(late, 0.3 * np.sin(phase), atol=1e-12)
+            differences.append(np.abs(late - other))
     differences = np.array(differences)
     assert differences[:200].max() < 1e-12  # equal until omega changes
     assert differences[:, 0].max() < 1e-12  # the master itself is Eq. 2 always
     # When the change has reached the whole body the lag is 2 pi / 6 and no more pi / 6.
     t = 8.0
     expected = 0.3 * np.sin(OMEGA * (2 * t - 4.0) - np.arange(13) * 2 * OMEGA * TAU)
-    np.testing.assert_allclose(one, expected, atol=1e-12)
+    np.testing.assert_allclose(late, expected, atol=1e-12)
     assert differences[-1].max() > 0.2
 
 

@@ -60,9 +60,9 @@ def test_the_logged_values_give_the_commands_back(make_robot):
     assert gait.names[:6] == (*(f"horizontal.{name}" for name in parts), "vertical.A")
     for start, columns in ((0, slice(0, None, 2)), (5, slice(1, None, 2))):
         A, _, lag, offset, phase = (values[:, start + k, None] for k in range(5))
-        own = commands[:, columns]
-        expected = A * np.sin(phase + np.arange(own.shape[1]) * lag) + offset
-        np.testing.assert_allclose(own, expected, atol=1e-14)
+        of_plane = commands[:, columns]
+        expected = A * np.sin(phase + np.arange(of_plane.shape[1]) * lag) + offset
+        np.testing.assert_allclose(of_plane, expected, atol=1e-14)
 
 
 def test_the_start_is_smooth(make_robot):
@@ -91,7 +91,7 @@ def test_too_much_amplitude_is_cut_keeping_the_wave(make_robot):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "expected"),
+    ("wishes", "expected"),
     [
         ((0.3, 0.1), (0.3, 0.1)),
         ((0.5, 0.3), (0.2, 0.3)),
@@ -100,9 +100,9 @@ def test_too_much_amplitude_is_cut_keeping_the_wave(make_robot):
         ((0.3, -0.9), (0.0, -0.2)),
     ],
 )
-def test_limits_need_not_be_symmetric(wanted, expected):
-    one = [np.array([value]) for value in (*wanted, -0.2, 0.5)]
-    assert [value[0] for value in within_limits(*one)] == pytest.approx(expected)
+def test_limits_need_not_be_symmetric(wishes, expected):
+    arrays = [np.array([value]) for value in (*wishes, -0.2, 0.5)]
+    assert [value[0] for value in within_limits(*arrays)] == pytest.approx(expected)
 
 
 def test_smoothstep():

@@ -24,7 +24,7 @@ STEP_S = 0.01
 def snake(limits=((-math.pi / 6, math.pi / 6),) * 7):
     robot = load_robot("snake13")
     pairs = zip(robot.joints, limits, strict=False)
-    joints = [dataclasses.replace(one, lower=least, upper=most) for one, (least, most) in pairs]
+    joints = [dataclasses.replace(joint, lower=least, upper=most) for joint, (least, most) in pairs]
     return dataclasses.replace(robot, links=robot.links[:8], joints=tuple(joints))
 
 
@@ -116,7 +116,7 @@ def test_a_modulation_acts_on_its_own_joint_from_the_next_step_on():
     factors, offsets = change.amplitude_factor.copy(), change.offset.copy()
     factors[2], offsets[5] = 0.5, 0.1
     gait.modulate(Modulation(factors, offsets))
-    moved, still = (one.step(0.4, NOTHING).command for one in (gait, plain))
+    moved, still = (generator.step(0.4, NOTHING).command for generator in (gait, plain))
     np.testing.assert_allclose(moved, still * factors + offsets, atol=1e-15)
 
 
@@ -137,10 +137,10 @@ def test_unlike_limits_cut_each_joint_by_its_own_and_are_reported():
     limits = ((-0.1, 0.3), (-0.5, 0.5), (-0.5, 0.5), *(((-0.5, 0.5),) * 4))
     gait = generator(Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, 0.8)}, 0.0), snake(limits))
     tick = gait.step(0.0, NOTHING)
-    found = dict(zip(gait.names, tick.values, strict=True))
+    values = dict(zip(gait.names, tick.values, strict=True))
     assert tick.clamped == ("joint01.A",)
-    assert [found[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
-    assert "joint02.A" not in found  # its plane is not driven
+    assert [values[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
+    assert "joint02.A" not in values  # its plane is not driven
 
 
 @pytest.mark.parametrize(

@@ -65,51 +65,51 @@ def commands(name):
 @pytest.mark.nightly
 @pytest.mark.parametrize(("name", "speed"), [("caterpillar", 0.039), ("caterpillar-pi2", 0.023)])
 def test_a_caterpillar_creeps_straight_ahead(name, speed):
-    found = motion(name)
-    assert found.forward == pytest.approx(speed, rel=0.03)
-    assert abs(found.left) < 1e-3 * found.speed
+    travel = motion(name)
+    assert travel.forward == pytest.approx(speed, rel=0.03)
+    assert abs(travel.left) < 1e-3 * travel.speed
 
 
 @pytest.mark.nightly
 def test_a_sidewinder_walks_sideways():
-    found = motion("sidewinding")
-    assert 0.27 <= found.speed <= 0.32
-    assert abs(found.left) > 0.95 * found.speed
-    assert abs(found.turns_per_s) < 0.02  # it walks, it doesn't roll
+    travel = motion("sidewinding")
+    assert 0.27 <= travel.speed <= 0.32
+    assert abs(travel.left) > 0.95 * travel.speed
+    assert abs(travel.turns_per_s) < 0.02  # it walks, it doesn't roll
 
 
 @pytest.mark.nightly
 def test_rolling_turns_once_a_cycle_and_slips_a_little():
-    found = motion("rolling")
-    assert abs(found.turns_per_s) == pytest.approx(0.5, rel=0.01)
-    assert abs(found.left) > 0.99 * found.speed
+    travel = motion("rolling")
+    assert abs(travel.turns_per_s) == pytest.approx(0.5, rel=0.01)
+    assert abs(travel.left) > 0.99 * travel.speed
     # A straight cylinder would roll at 2 pi r f; an arc has to slip.
-    assert 0.8 < found.speed / (2 * math.pi * 0.025 * 0.5) < 1.0
+    assert 0.8 < travel.speed / (2 * math.pi * 0.025 * 0.5) < 1.0
 
 
 @pytest.mark.nightly
 def test_a_helix_rolls_and_screws():
-    found = motion("twist")
-    assert 0.05 <= found.speed <= 0.11
-    assert abs(found.turns_per_s) == pytest.approx(0.5, rel=0.02)
-    assert abs(found.forward) > 0.2 * found.speed  # obliquely, unlike rolling
+    travel = motion("twist")
+    assert 0.05 <= travel.speed <= 0.11
+    assert abs(travel.turns_per_s) == pytest.approx(0.5, rel=0.02)
+    assert abs(travel.forward) > 0.2 * travel.speed  # obliquely, unlike rolling
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["horizontal", "vertical", "combined"])
 def test_waves_of_the_papers_equations_go_head_first_and_straight(name):
-    found = motion(name)
-    assert found.forward > 0.04
+    travel = motion(name)
+    assert travel.forward > 0.04
     # Half a cycle later one wave alone is its own mirror image, two waves at once are not.
-    assert abs(found.left) < (0.02 if name == "combined" else 1e-3) * found.speed
+    assert abs(travel.left) < (0.02 if name == "combined" else 1e-3) * travel.speed
 
 
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators", "oscillators-one-way"])
 def test_other_generators_settle_into_the_wave_of_flat(name):
-    found, flat = commands(name), commands("flat")
-    assert np.abs(found[100] - flat[100]).max() > 0.05
+    angles, flat = commands(name), commands("flat")
+    assert np.abs(angles[100] - flat[100]).max() > 0.05
     settled = round(load_scenario(name).settle_s * 100)
-    np.testing.assert_allclose(found[settled:], flat[settled:], atol=2e-3)
+    np.testing.assert_allclose(angles[settled:], flat[settled:], atol=2e-3)
 
 
 @pytest.mark.nightly

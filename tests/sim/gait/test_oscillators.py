@@ -251,9 +251,9 @@ def test_feedback_against_scipy(make_robot):
 
     times = np.arange(401) / 100
     # Integrated tick by tick: what is reported at a tick is held until the next.
-    state, found = -PSI * np.arange(n) + start, []
+    state, states = -PSI * np.arange(n) + start, []
     for k, t0 in enumerate(times):
-        found.append(state)
+        states.append(state)
         if k == 400:
             break
         # Readings come with the tick after the command, as `run` hands them over.
@@ -267,7 +267,7 @@ def test_feedback_against_scipy(make_robot):
         ends = np.array([0.0, 0.01])
         half = np.full(n - 1, 0.5)
         state = foreign_phases(state, half, half, np.zeros(n), times=ends, drive=drive)[-1]
-    np.testing.assert_allclose(theta, found, atol=1e-7)
+    np.testing.assert_allclose(theta, states, atol=1e-7)
 
 
 @pytest.mark.nightly
@@ -343,8 +343,8 @@ def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
 
 def test_the_frequency_factor_turns_every_oscillator(make_robot):
     robot = make_robot(4, planar=True)
-    one = OscillatorChain(0.3, 0.5, PSI, detuning=(0.0, 0.5, -0.5), **UNCOUPLED)
-    gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: one}), robot)
+    oscillators = OscillatorChain(0.3, 0.5, PSI, detuning=(0.0, 0.5, -0.5), **UNCOUPLED)
+    gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: oscillators}), robot)
     gait.modulate(dataclasses.replace(Modulation.none(3), frequency_factor=2.0))
     first, last = (gait.step(t, nothing(3)).values[-3:] for t in (0.0, 3.0))
     rates = 2.0 * (OMEGA + np.array([0.0, 0.5, -0.5]))

@@ -69,9 +69,9 @@ def test_joints_cannot_change_the_momentum(uneven, writhe):
     def momentum(state):
         turns = rotation_from_quaternion(state.quaternion.T)
         world_inertia = turns @ (inertia[:, :, None] * turns.swapaxes(1, 2))
-        own = np.einsum("nij,jn->i", world_inertia, state.spin)
+        intrinsic = np.einsum("nij,jn->i", world_inertia, state.spin)
         orbital = mass @ np.cross(state.position.T, state.velocity.T)
-        return np.concatenate([state.velocity @ mass, own + orbital])
+        return np.concatenate([state.velocity @ mass, intrinsic + orbital])
 
     def drift(rate_hz):
         momenta = np.array([momentum(state) for state in writhe(rate_hz)])
@@ -146,14 +146,14 @@ def test_the_urdf_describes_the_same_body(uneven, tmp_path):
     for i, link in enumerate(uneven.links):
         dynamics = pybullet.getDynamicsInfo(body, i - 1, client)
         assert (dynamics[0], dynamics[2]) == (link.mass, link.inertia)
-    found = pybullet.getLinkStates(body, range(4), 0, 1, client)
+    link_states = pybullet.getLinkStates(body, range(4), 0, 1, client)
     pybullet.disconnect(client)
     centres, turns = link_poses(uneven, np.zeros(3), np.eye(3), angles)
-    np.testing.assert_allclose([state[0] for state in found], centres[1:], atol=1e-7)
-    quaternions = np.array([[0, 0, 0, 1.0], *(state[1] for state in found)])
+    np.testing.assert_allclose([state[0] for state in link_states], centres[1:], atol=1e-7)
+    quaternions = np.array([[0, 0, 0, 1.0], *(state[1] for state in link_states)])
     np.testing.assert_allclose(rotation_from_quaternion(quaternions), turns, atol=1e-7)
     origins = frame_origins(uneven, centres, quaternions)
-    np.testing.assert_allclose([state[4] for state in found], origins[1:], atol=1e-7)
+    np.testing.assert_allclose([state[4] for state in link_states], origins[1:], atol=1e-7)
 
 
 def test_the_urdf_is_plain_xml_with_shapes(uneven):
@@ -166,5 +166,5 @@ def test_two_bodies_live_side_by_side(make_scenario, make_robot):
     small = make_scenario(make_robot(4), duration_s=0.2, ramp_s=0.0)
     expected = [sample.step.body.angle for sample in simulate(small)]
     with Twin(small) as twin, Twin(make_scenario(make_robot(6), amplitude=0.0)) as other:
-        found = [a.step.body.angle for a, _ in zip(twin.samples(), other.samples(), strict=False)]
-    assert math.isclose(np.abs(np.array(found) - expected[: len(found)]).max(), 0.0)
+        angles = [a.step.body.angle for a, _ in zip(twin.samples(), other.samples(), strict=False)]
+    assert math.isclose(np.abs(np.array(angles) - expected[: len(angles)]).max(), 0.0)

@@ -45,8 +45,10 @@ def test_laws_agree_to_the_last_digits(uneven, law):
             compute.follow(1)
         ours, theirs = (steps.stacked for steps in tables)
         for group, other in zip(ours[1:4], theirs[1:4], strict=True):
-            for one, two in zip(group, other, strict=True):
-                np.testing.assert_allclose(two, one, rtol=1e-13, atol=1e-13 * np.abs(one).max())
+            for measured, two in zip(group, other, strict=True):
+                np.testing.assert_allclose(
+                    two, measured, rtol=1e-13, atol=1e-13 * np.abs(measured).max()
+                )
     assert 0 < np.count_nonzero(ours.contact.force[:, 2]) < 12  # some touch, some don't
 
 
@@ -68,8 +70,8 @@ def test_the_chain_lies_where_the_kinematics_has_it_and_moves_as_the_engine_says
         np.testing.assert_allclose(ours.position.T, centres, atol=1e-14)
         np.testing.assert_allclose(rotation_from_quaternion(ours.quaternion.T), turns, atol=1e-14)
         for name in ("position", "velocity", "spin", "angle", "rate"):
-            one, two = getattr(theirs, name), getattr(ours, name)
-            np.testing.assert_allclose(two, one, atol=1e-12 * (1 + np.abs(one).max()))
+            reference, two = getattr(theirs, name), getattr(ours, name)
+            np.testing.assert_allclose(two, reference, atol=1e-12 * (1 + np.abs(reference).max()))
         # Pushed in two calls, off the centres, and with torques: the generalised force.
         force = random.normal(scale=0.3, size=(2, 3, 6))
         point = theirs.position + random.normal(scale=0.01, size=(2, 3, 6))
@@ -94,10 +96,10 @@ def test_a_run_is_the_same_within_rounding(make_scenario, uneven, engine):
     )
     assert ours[-1].contact_s.any()
     for k in (1, 100, 200):
-        one, two = ours[k], theirs[k]
-        np.testing.assert_allclose(one.step.body.position, two.step.body.position, atol=1e-12)
-        np.testing.assert_allclose(one.step.body.angle, two.step.body.angle, atol=1e-12)
-        np.testing.assert_allclose(one.energy, two.energy, atol=1e-12)
+        mine, two = ours[k], theirs[k]
+        np.testing.assert_allclose(mine.step.body.position, two.step.body.position, atol=1e-12)
+        np.testing.assert_allclose(mine.step.body.angle, two.step.body.angle, atol=1e-12)
+        np.testing.assert_allclose(mine.energy, two.energy, atol=1e-12)
 
 
 def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
@@ -130,10 +132,10 @@ def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words
         f"import sys; sys.modules[{package!r}] = None; import undulog\n"
         f"sys.exit(undulog.run(['sim', 'run', 'a.toml', '-o', 'a.mcap', *{words.split()!r}]))"
     )
-    found = python(code, cwd=tmp_path)
+    completed = python(code, cwd=tmp_path)
     if words.endswith("auto"):
-        assert (found.returncode, found.stderr) == (0, "")
+        assert (completed.returncode, completed.stderr) == (0, "")
     else:
-        assert found.returncode == 2
-        assert f"needs the package {package}, which is not installed" in found.stderr
-        assert f"the extra '{package}' brings it: pip install '{package}>=" in found.stderr
+        assert completed.returncode == 2
+        assert f"needs the package {package}, which is not installed" in completed.stderr
+        assert f"the extra '{package}' brings it: pip install '{package}>=" in completed.stderr

@@ -130,9 +130,9 @@ def test_a_spinning_link_slips_at_its_lowest_point():
     # Rolling about x without moving: the contact point, r below, moves at omega x r = +y.
     zero, level = np.zeros((3, 1)), np.array([[0.0], [0.0], [0.0], [1.0]])
     low, spin = np.array([[0.0], [0.0], [0.024]]), np.array([[4.0], [0.0], [0.0]])
-    found = touch(Ground(), low, level, zero, spin)
-    assert found.velocity[:, 0] == pytest.approx([0.0, 4.0 * 0.025, 0.0])
-    assert found.force[1, 0] < 0.0
+    contact = touch(Ground(), low, level, zero, spin)
+    assert contact.velocity[:, 0] == pytest.approx([0.0, 4.0 * 0.025, 0.0])
+    assert contact.force[1, 0] < 0.0
 
 
 def test_without_ground_there_is_no_force():

@@ -86,11 +86,11 @@ def test_a_tilted_block_at_rest_feels_gravitys_opposite(make_accelerometer, degr
 def test_free_fall_feels_nothing_and_thrust_feels_itself(make_accelerometer):
     level = Rotation.identity()
     fall = taken(make_accelerometer(), 2, lambda t: ((0, 0, 0), (0, 0, -G * t), level, (0, 0, 0)))
-    np.testing.assert_allclose([one.vector for one in fall], 0.0, atol=1e-9)
+    np.testing.assert_allclose([sample.vector for sample in fall], 0.0, atol=1e-9)
     thrust = taken(
         make_accelerometer(), 2, lambda t: ((0, 0, 0), (3.0 * t, 0, 0), level, (0, 0, 0))
     )
-    np.testing.assert_allclose([one.vector for one in thrust], [(3.0, 0, G)] * 2, atol=1e-9)
+    np.testing.assert_allclose([sample.vector for sample in thrust], [(3.0, 0, G)] * 2, atol=1e-9)
 
 
 def test_a_turning_mount_feels_the_centripetal_force(make_accelerometer):
@@ -124,28 +124,28 @@ def test_the_sensor_frame_is_turned_in_the_links(make_accelerometer):
     rpy = (0.3, -0.2, 1.1)
     turn = Rotation.from_euler("xyz", rpy)
     np.testing.assert_allclose(rotation_from_rpy(rpy), turn.as_matrix(), atol=1e-15)
-    found = taken(make_accelerometer(accelerometer(rpy=rpy)), 1, at_rest(0.4, 0.1, -0.3))[0].vector
+    vector = taken(make_accelerometer(accelerometer(rpy=rpy)), 1, at_rest(0.4, 0.1, -0.3))[0].vector
     frame = Rotation.from_euler("ZYX", (0.4, 0.1, -0.3)) * turn
-    np.testing.assert_allclose(found, frame.inv().apply((0, 0, G)), atol=1e-12)
+    np.testing.assert_allclose(vector, frame.inv().apply((0, 0, G)), atol=1e-12)
 
 
 def test_slower_sampling_means_over_its_own_period(make_accelerometer):
     kind = make_accelerometer(model=dataclasses.replace(EXACT, rate_hz=40.0))
     thrust = taken(kind, 10, lambda t: ((0, 0, 0), (t * t, 0, 0), Rotation.identity(), (0, 0, 0)))
-    assert [one.time_s for one in thrust] == pytest.approx([0.0125, 0.0375, 0.0625, 0.0875])
+    assert [sample.time_s for sample in thrust] == pytest.approx([0.0125, 0.0375, 0.0625, 0.0875])
     # v = t^2: the mean acceleration around t is 2 t.
-    expected = [2 * one.time_s for one in thrust]
-    np.testing.assert_allclose([one.vector[0] for one in thrust], expected, atol=1e-9)
+    expected = [2 * sample.time_s for sample in thrust]
+    np.testing.assert_allclose([sample.vector[0] for sample in thrust], expected, atol=1e-9)
 
 
 def test_the_accelerometer_has_noise_and_steps(make_accelerometer):
     noisy = dataclasses.replace(EXACT, noise=0.05)
     kind = make_accelerometer(model=noisy)
-    values = np.array([one.vector for one in taken(kind, 3000, at_rest(0.0, 0.0, 0.0))])
+    values = np.array([sample.vector for sample in taken(kind, 3000, at_rest(0.0, 0.0, 0.0))])
     np.testing.assert_allclose(values.std(axis=0), 0.05, rtol=0.05)
     np.testing.assert_allclose(values.mean(axis=0), (0, 0, G), atol=4e-3)
     kind = make_accelerometer(model=dataclasses.replace(noisy, resolution=0.04))
-    values = np.array([one.vector for one in taken(kind, 100, at_rest(0.0, 0.0, 0.0))]) / 0.04
+    values = np.array([sample.vector for sample in taken(kind, 100, at_rest(0.0, 0.0, 0.0))]) / 0.04
     np.testing.assert_allclose(values, np.rint(values), atol=1e-9)
 
 
@@ -187,5 +187,7 @@ def test_the_compass_has_its_rate_noise_and_steps(make_compass):
     values = np.array([sample.vector[:2] for sample in samples])
     np.testing.assert_allclose(values.std(axis=0), 2e-7, rtol=0.1)
     kind = make_compass(model=CompassModel())
-    steps = np.array([one.vector[:2] for one in taken(kind, 50, at_rest(0.3, 0.0, 0.0))]) / 1e-7
+    steps = (
+        np.array([sample.vector[:2] for sample in taken(kind, 50, at_rest(0.3, 0.0, 0.0))]) / 1e-7
+    )
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)

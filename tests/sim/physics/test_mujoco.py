@@ -116,8 +116,10 @@ with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:
     rows = [b"".join(part.tobytes() for part in s.step.body) for s in twin.samples()]
 print(hashlib.sha256(b"".join(rows)).hexdigest())
 """
-    found = {python(code, env=os.environ | {"PYTHONHASHSEED": seed}).stdout for seed in ("1", "2")}
-    assert (len(found), len(*found)) == (1, 65)
+    digests = {
+        python(code, env=os.environ | {"PYTHONHASHSEED": seed}).stdout for seed in ("1", "2")
+    }
+    assert (len(digests), len(*digests)) == (1, 65)
 
 
 def test_an_impossible_state_is_an_error_and_leaves_no_file(

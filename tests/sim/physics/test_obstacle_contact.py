@@ -61,9 +61,9 @@ def test_what_is_out_of_reach_never_acts(seed):
         near = all_of_them.reachable(position, way)
         direction = random.uniform(-np.pi, np.pi, 3)
         position[:2] += way * random.uniform(0, 1, 3) * [np.cos(direction), np.sin(direction)]
-        found = near(position, quaternion, *motion)
-        for one, other in zip(found, all_of_them(position, quaternion, *motion), strict=True):
-            np.testing.assert_array_equal(one, other)
+        nearby = near(position, quaternion, *motion)
+        for part, other in zip(nearby, all_of_them(position, quaternion, *motion), strict=True):
+            np.testing.assert_array_equal(part, other)
         left_out += len(scattered) - sum(len(shape.height) for shape in near.shapes)
     assert left_out > 0.3 * 100 * len(scattered)
 
@@ -172,9 +172,9 @@ def test_the_bound_on_friction_goes_with_the_step():
     exact = law(FIELD, links=400)(*links)
     worst = []
     for dt in (1e-4, 1e-5, 1e-6, 1e-7):
-        found = law(FIELD, links=400, dt=dt)(*links)
-        np.testing.assert_array_equal(found.depth, exact.depth)
-        worst.append(np.linalg.norm(found.force - exact.force, axis=0).max())
+        contact = law(FIELD, links=400, dt=dt)(*links)
+        np.testing.assert_array_equal(contact.depth, exact.depth)
+        worst.append(np.linalg.norm(contact.force - exact.force, axis=0).max())
     assert all(np.diff(worst) < 0.0)
     assert worst[-1] < 1e-4 * np.linalg.norm(exact.force, axis=0).max()
 
@@ -215,13 +215,13 @@ class Block:
         return pushes(self.position, about_z(self.angle), self.velocity, self.spin)
 
     def step(self, pushes, dt):
-        found = self.contact(pushes)
-        arm = found.point - self.position
-        self.velocity = self.velocity + dt * found.force.sum(axis=1)[:, None] / MASS
-        self.spin[2] += dt * (arm[0] * found.force[1] - arm[1] * found.force[0]).sum() / INERTIA
+        contact = self.contact(pushes)
+        arm = contact.point - self.position
+        self.velocity = self.velocity + dt * contact.force.sum(axis=1)[:, None] / MASS
+        self.spin[2] += dt * (arm[0] * contact.force[1] - arm[1] * contact.force[0]).sum() / INERTIA
         self.position = self.position + dt * self.velocity
         self.angle = self.angle + dt * self.spin[2]
-        return found
+        return contact
 
     def energy(self, pushes):
         depth = self.contact(pushes).depth

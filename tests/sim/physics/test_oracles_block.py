@@ -143,8 +143,8 @@ def test_pushed_sideways_a_straight_robot_rolls_as_a_log(slide, engine):
     samples = slide(engine, axis="across", slope=slope, radius=RADIUS, duration_s=1.0)
     expected = G * math.sin(slope) / (1 + 4e-5 / (MASS * RADIUS**2))
     # From 0.5 s on, when the creep that passes the friction on is steady.
-    found = (velocity(samples[-1]) - velocity(samples[50]))[0] / 0.5
-    assert found == pytest.approx(expected, rel=1e-6)
+    acceleration = (velocity(samples[-1]) - velocity(samples[50]))[0] / 0.5
+    assert acceleration == pytest.approx(expected, rel=1e-6)
 
 
 @both_engines

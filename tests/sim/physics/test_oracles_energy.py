@@ -73,7 +73,7 @@ def folding(make_robot, make_scenario):
     def run(rate_hz, **servo):
         robot = make_robot(2, limit=math.pi, **servo)
         link = Link("link", LENGTH, 0.01, MASS, (INERTIA, INERTIA, INERTIA))
-        links = tuple(dataclasses.replace(link, name=one.name) for one in robot.links)
+        links = tuple(dataclasses.replace(link, name=module.name) for module in robot.links)
         scenario = make_scenario(
             dataclasses.replace(robot, links=links),
             gait=Serpentine({Plane.HORIZONTAL: PlaneGait(0.0, 1.0, 0.0, offset=COMMAND)}, 0.0),

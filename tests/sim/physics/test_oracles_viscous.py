@@ -63,11 +63,11 @@ def overdamped_chain(links, lag, a, steps=200):
         directions = [np.ones(links), 1j * np.ones(links), 1j * arm]
 
         def drag(velocity):
-            own = velocity * along.conj()
-            return (own.real + 1j * ANISOTROPY * own.imag) * along
+            local = velocity * along.conj()
+            return (local.real + 1j * ANISOTROPY * local.imag) * along
 
-        def work(one, other):
-            return (one * drag(other).conj()).real.sum()
+        def work(first, other):
+            return (first * drag(other).conj()).real.sum()
 
         matrix = [[work(p, q) for q in directions] for p in directions]
         head = np.linalg.solve(matrix, [-work(p, carried) for p in directions])
@@ -78,8 +78,8 @@ def overdamped_chain(links, lag, a, steps=200):
     start = motion(0.0, 0.0)[2]
     for k in range(steps):  # the midpoint rule
         half = state + dt / 2 * motion(k * dt, state[2])[0]
-        rate, one, _ = motion((k + 0.5) * dt, half[2])
-        state, power = state + dt * rate, power + dt * one
+        rate, flow, _ = motion((k + 0.5) * dt, half[2])
+        state, power = state + dt * rate, power + dt * flow
     end = motion(1.0, state[2])[2]
     return abs(complex(*state[:2]) + end - start), power / links
 
@@ -162,7 +162,7 @@ def test_what_is_left_over_goes_with_the_step(run_twin):
 def test_at_small_amplitude_speed_goes_with_its_square(run_twin):
     # Liljebäck et al., IROS 2010, of viscous ground: twice the amplitude, four times the speed.
     links, lag, a = 13, math.radians(30), 0.03
-    small, large = (run_twin(links, lag, one)[0] for one in (a, 2 * a))
-    chain, larger = (overdamped_chain(links, lag, one)[0] for one in (a, 2 * a))
+    small, large = (run_twin(links, lag, amplitude)[0] for amplitude in (a, 2 * a))
+    chain, larger = (overdamped_chain(links, lag, amplitude)[0] for amplitude in (a, 2 * a))
     assert large / small == pytest.approx(larger / chain, rel=5e-3)
     assert large / small == pytest.approx(4.0, rel=0.03)

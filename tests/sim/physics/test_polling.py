@@ -124,10 +124,10 @@ def test_the_encoder_sends_whole_steps():
 def test_within_its_dead_band_the_encoder_stands_still():
     swing, band = 0.02, 0.015
     run = moving(40, lambda t: np.full(JOINTS, swing * math.sin(2 * math.pi * 5 * t)))
-    found = np.array([s.position[0] for s in cycles(polling(ServoPolling(dead_band=band)), run)])
+    readings = np.array([s.position[0] for s in cycles(polling(ServoPolling(dead_band=band)), run)])
     true = swing * np.sin(2 * np.pi * 5 * 0.01 * np.arange(41))
-    assert np.abs(found - true).max() <= band
-    changes = np.diff(found)
+    assert np.abs(readings - true).max() <= band
+    changes = np.diff(readings)
     assert (np.abs(changes[changes != 0.0]) > band).all()
     still = moving(5, lambda t: np.full(JOINTS, 0.9 * band * math.sin(100 * t)))
     for sample in cycles(polling(ServoPolling(dead_band=band)), still):

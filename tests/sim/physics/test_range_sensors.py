@@ -189,7 +189,7 @@ def test_the_sonar_is_limited_and_has_steps_and_noise(robot):
     def samples(x, model, periods=1):
         caster = RayCaster([Wall((x + 0.04, -9.0), (x + 0.04, 9.0), 0.02)], ground=True)
         kind = Sonar(model, [SONAR], robot, caster, dt=DT, seed=1)
-        return np.array([one.distance for one in taken(kind, periods)])
+        return np.array([sample.distance for sample in taken(kind, periods)])
 
     assert (samples(4.2, QUIET)[0], samples(0.01, QUIET)[0]) == (math.inf, 0.03)
     noisy = samples(2.0, dataclasses.replace(QUIET, noise=0.005), 4000)

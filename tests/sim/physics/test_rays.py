@@ -12,7 +12,7 @@ from undulog.sim.scenario.obstacles import Box, Cylinder, Wall
 INF = math.inf
 
 
-def one(caster, origin, direction, **options):
+def cast(caster, origin, direction, **options):
     way = np.array(direction, dtype=float)[:, None]
     start = np.array(origin, dtype=float)[:, None]
     return float(caster.distance(start, way / np.linalg.norm(way), **options)[0])
@@ -22,45 +22,45 @@ def one(caster, origin, direction, **options):
 def test_a_wall_seen_at_an_angle(degrees):
     caster = RayCaster([Wall((1.0, -5.0), (1.0, 5.0), thickness=0.1)], ground=False)
     angle = math.radians(degrees)
-    found = one(caster, (0, 0, 0.1), (math.cos(angle), math.sin(angle), 0.0))
-    assert found == pytest.approx(0.95 / math.cos(angle), rel=1e-14)
+    distance = cast(caster, (0, 0, 0.1), (math.cos(angle), math.sin(angle), 0.0))
+    assert distance == pytest.approx(0.95 / math.cos(angle), rel=1e-14)
 
 
 def test_a_cylinder_off_the_line_of_sight():
     caster = RayCaster([Cylinder((2.0, 0.3), 0.5, 1.0)], ground=False)
-    assert one(caster, (0, 0, 0.1), (1, 0, 0)) == pytest.approx(2.0 - 0.4, rel=1e-14)
-    assert one(caster, (0, -0.3, 0.1), (1, 0, 0)) == INF
-    assert one(caster, (0, 0, 0.1), (-1, 0, 0)) == INF  # behind
-    assert one(caster, (2.1, 0.3, 0.1), (1, 0, 0)) == 0.0  # from inside
+    assert cast(caster, (0, 0, 0.1), (1, 0, 0)) == pytest.approx(2.0 - 0.4, rel=1e-14)
+    assert cast(caster, (0, -0.3, 0.1), (1, 0, 0)) == INF
+    assert cast(caster, (0, 0, 0.1), (-1, 0, 0)) == INF  # behind
+    assert cast(caster, (2.1, 0.3, 0.1), (1, 0, 0)) == 0.0  # from inside
 
 
 def test_over_the_top_and_onto_it():
     shapes = [Cylinder((2.0, 0.0), 0.5, 0.2), Box((5.0, 0.0), (1.0, 1.0), 0.3, 0.2)]
     caster = RayCaster(shapes, ground=False)
-    assert one(caster, (0, 0, 0.21), (1, 0, 0)) == INF
-    assert one(caster, (2.0, 0.1, 1.0), (0, 0, -1)) == pytest.approx(0.8)
-    assert one(caster, (5.0, 0.1, 1.0), (0, 0, -1)) == pytest.approx(0.8)
-    assert one(caster, (7.0, 0.1, 1.0), (0, 0, -1)) == INF
+    assert cast(caster, (0, 0, 0.21), (1, 0, 0)) == INF
+    assert cast(caster, (2.0, 0.1, 1.0), (0, 0, -1)) == pytest.approx(0.8)
+    assert cast(caster, (5.0, 0.1, 1.0), (0, 0, -1)) == pytest.approx(0.8)
+    assert cast(caster, (7.0, 0.1, 1.0), (0, 0, -1)) == INF
     # Over the front edge onto the top.
-    assert one(caster, (0, 0, 0.8), (2.0, 0.0, -0.6)) == pytest.approx(math.hypot(2.0, 0.6))
+    assert cast(caster, (0, 0, 0.8), (2.0, 0.0, -0.6)) == pytest.approx(math.hypot(2.0, 0.6))
 
 
 def test_the_ground():
     caster = RayCaster([], ground=True)
-    assert one(caster, (0, 0, 0.5), (1, 0, -1)) == pytest.approx(math.sqrt(0.5))
-    assert one(caster, (0, 0, 0.5), (1, 0, 0)) == INF
-    assert one(caster, (0, 0, 0.5), (1, 0, 1)) == INF
-    assert one(caster, (0, 0, -0.1), (0, 0, 1)) == 0.0
-    assert one(caster, (0, 0, 0.5), (1, 0, -1), ground=False) == INF
-    assert one(RayCaster([], ground=False), (0, 0, 0.5), (0, 0, -1)) == INF
+    assert cast(caster, (0, 0, 0.5), (1, 0, -1)) == pytest.approx(math.sqrt(0.5))
+    assert cast(caster, (0, 0, 0.5), (1, 0, 0)) == INF
+    assert cast(caster, (0, 0, 0.5), (1, 0, 1)) == INF
+    assert cast(caster, (0, 0, -0.1), (0, 0, 1)) == 0.0
+    assert cast(caster, (0, 0, 0.5), (1, 0, -1), ground=False) == INF
+    assert cast(RayCaster([], ground=False), (0, 0, 0.5), (0, 0, -1)) == INF
 
 
 def test_along_a_face_and_straight_up():
     caster = RayCaster([Box((1.0, 0.0), (1.0, 1.0), 0.0, 0.5)], ground=False)
-    assert one(caster, (0, 0.5000001, 0.1), (1, 0, 0)) == INF
-    assert one(caster, (0, 0.4999999, 0.1), (1, 0, 0)) == pytest.approx(0.5)
-    assert one(caster, (1.0, 0.0, 2.0), (0, 0, 1)) == INF
-    assert one(RayCaster([Cylinder((0, 0), 0.1)], ground=False), (0, 0, 2.0), (0, 0, 1)) == INF
+    assert cast(caster, (0, 0.5000001, 0.1), (1, 0, 0)) == INF
+    assert cast(caster, (0, 0.4999999, 0.1), (1, 0, 0)) == pytest.approx(0.5)
+    assert cast(caster, (1.0, 0.0, 2.0), (0, 0, 1)) == INF
+    assert cast(RayCaster([Cylinder((0, 0), 0.1)], ground=False), (0, 0, 2.0), (0, 0, 1)) == INF
 
 
 @pytest.fixture

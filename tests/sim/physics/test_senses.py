@@ -80,24 +80,26 @@ def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
 def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_path):
     path = tmp_path / "senses.mcap"
     sim.record(scenario, path)
-    value = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
+    value = [(sample.tick, reading) for sample, _ in run[0] for reading in sample.sensed]
     topics = {sensor.name: sensor.topic for sensor in scenario.robot.sensors}
     with Session.open(path) as session:
         for name, topic in topics.items():
-            mine = [(tick, one) for tick, one in value if getattr(one, "name", "") == name]
-            found = list(session.messages(topic))
-            assert len(found) == len(mine) > 5
-            for (tick, one), (log_ns, message) in zip(mine, found, strict=True):
+            mine = [
+                (tick, reading) for tick, reading in value if getattr(reading, "name", "") == name
+            ]
+            received = list(session.messages(topic))
+            assert len(received) == len(mine) > 5
+            for (tick, reading), (log_ns, message) in zip(mine, received, strict=True):
                 assert log_ns == scenario.epoch_ns + tick * 10_000_000
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-                assert stamp == scenario.epoch_ns + round(one.time_s * 1e9)
+                assert stamp == scenario.epoch_ns + round(reading.time_s * 1e9)
                 assert message.header.frame_id == name
-                if isinstance(one, VectorSample):
+                if isinstance(reading, VectorSample):
                     field = "magnetic_field" if topic == "/compass" else "linear_acceleration"
                     vector = getattr(message, field)
-                    np.testing.assert_array_equal([vector.x, vector.y, vector.z], one.vector)
+                    np.testing.assert_array_equal([vector.x, vector.y, vector.z], reading.vector)
                 else:
-                    assert message.range == np.float32(one.distance)
+                    assert message.range == np.float32(reading.distance)
         assert session.warnings == []
 
 
@@ -113,15 +115,17 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
         short = {"frequency_hz": hz, "ramp_s": 0.5, "duration_s": 4.0}
         scenario = make_scenario(robot, **short, sensing=sim.SensorModels(servo))
         chosen = sensed(scenario)[-202:-2]  # two whole cycles
-        angle = np.array([one.position for one in chosen])
-        cycle = np.array([one.cycle for one in chosen])[:, None] / 100
-        turn = 2 * np.pi * hz * (cycle + own_times * np.array([one.offset_s for one in chosen]))
-        found = []
+        angle = np.array([sample.position for sample in chosen])
+        cycle = np.array([sample.cycle for sample in chosen])[:, None] / 100
+        turn = (
+            2 * np.pi * hz * (cycle + own_times * np.array([sample.offset_s for sample in chosen]))
+        )
+        phases = []
         for t, q in zip(turn.T[yaw], angle.T[yaw], strict=True):
             basis = np.column_stack([np.cos(t), np.sin(t), np.ones_like(t)])
             c, d = np.linalg.lstsq(basis, q, rcond=None)[0][:2]
-            found.append(math.degrees(math.atan2(c, d)))
-        return np.array(found)
+            phases.append(math.degrees(math.atan2(c, d)))
+        return np.array(phases)
 
     at_once, in_turn = phases(sim.ServoPolling()), phases(sim.ServoPolling(slot_s=slot_s))
     # Within a control period the joints ripple, each command being held: 0.055 degrees from peak to
@@ -136,21 +140,26 @@ def test_without_its_sensors_a_robot_has_its_servos_only_and_moves_alike(scenari
     quiet = dataclasses.replace(scenario.sensing, enabled=False)
     mute = dataclasses.replace(scenario, sensing=quiet)
     samples = simulate(mute)
-    assert {type(one) for sample in samples for one in sample.sensed} == {JointSample}
+    assert {type(reading) for sample in samples for reading in sample.sensed} == {JointSample}
     assert sim.parse_scenario(mute.toml(), "y.toml") == mute
     np.testing.assert_array_equal(samples[-1].step.body.position, run[0][-1][0].step.body.position)
 
 
 def test_a_robot_without_sensors_has_none(make_scenario):
     for sample in simulate(make_scenario(duration_s=0.05)):
-        assert all(isinstance(one, JointSample) for one in sample.sensed)
+        assert all(isinstance(reading, JointSample) for reading in sample.sensed)
     assert sim.Readings.nothing(make_scenario().robot).ranges == {}
 
 
 def test_seeds_change_the_noise_and_only_that(scenario):
     def value(seed):
         samples = simulate(scenario.changed(seed=seed, duration_s=0.1))
-        values = [one.vector for s in samples for one in s.sensed if isinstance(one, VectorSample)]
+        values = [
+            reading.vector
+            for s in samples
+            for reading in s.sensed
+            if isinstance(reading, VectorSample)
+        ]
         return np.nan_to_num(values), samples[-1].step.body.angle
 
     (first, angle), (again, _), (other, same) = value(1), value(1), value(2)
@@ -199,7 +208,7 @@ def test_every_key_is_read_and_written_back():
 
 
 def test_faults_are_listed_at_once():
-    found = faults_of(
+    faults = faults_of(
         SNAKE25
         + """
             [sensing]
@@ -219,7 +228,7 @@ def test_faults_are_listed_at_once():
     )
     # 25 turns of 0.4 ms are a whole control period.
     check_keys(
-        found,
+        faults,
         "sensing.enabled sensing.gyro sensing.servo.slot_s sensing.servo.dead_band "
         "sensing.ir.hold_s sensing.ir.adc_bits sensing.sonar.rays sensing.compass.inclination",
     )

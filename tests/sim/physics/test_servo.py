@@ -34,12 +34,12 @@ def test_a_free_rotor_speeds_up_as_a_first_order_lag():
     servos, dt = Servos([servo]), 1e-5
     drag = servo.viscous_friction + servo.torque_constant**2 / servo.resistance_ohm
     final = servo.stall_torque / drag
-    state, zero, found = rotors(0.0), np.zeros(1), []
+    state, zero, speeds = rotors(0.0), np.zeros(1), []
     for _ in range(2000):
         state = servos.advance(state, servos.drive(np.array([1e3]), zero, zero, state), dt)
-        found.append(state.speed[0])
+        speeds.append(state.speed[0])
     expected = final * (1 - np.exp(-(dt * np.arange(1, 2001)) * drag / servo.rotor_inertia))
-    np.testing.assert_allclose(found, expected, atol=1e-3 * final)
+    np.testing.assert_allclose(speeds, expected, atol=1e-3 * final)
 
 
 @pytest.mark.parametrize("backlash", [0.0, 0.06])

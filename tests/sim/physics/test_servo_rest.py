@@ -128,5 +128,5 @@ def test_rotors_rest_at_every_reversal_and_the_ledger_closes_on_all_engines_and_
         assert abs(energy["mechanical_residual"]) < 1e-3 * energy["electrical_net"]
         assert energy["coulomb"] > 0
         angles.append(angle)
-    for one in angles[1:]:
-        np.testing.assert_allclose(one, angles[0], atol=1e-12)
+    for turned in angles[1:]:
+        np.testing.assert_allclose(turned, angles[0], atol=1e-12)

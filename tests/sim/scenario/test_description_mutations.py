@@ -41,8 +41,8 @@ def test_depth_and_long_integers_are_faults(kind, line, tmp_path, capsys):
 
 def changed(text: str, rng: random.Random) -> str:
     """One number of a text is another."""
-    found = rng.choice(list(NUMBER.finditer(text)))
-    return text[: found.start()] + rng.choice(ODD) + text[found.end() :]
+    match = rng.choice(list(NUMBER.finditer(text)))
+    return text[: match.start()] + rng.choice(ODD) + text[match.end() :]
 
 
 @pytest.mark.slow

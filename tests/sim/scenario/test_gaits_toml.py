@@ -37,13 +37,13 @@ common = {
 
 
 def numbers(count, most=100.0):
-    one = within(-most, most)
-    return one | st.lists(one, min_size=count, max_size=count).map(tuple)
+    number = within(-most, most)
+    return number | st.lists(number, min_size=count, max_size=count).map(tuple)
 
 
 def planes(part):
     return st.dictionaries(st.sampled_from(Plane), part, min_size=1).map(
-        lambda found: {plane: found[plane] for plane in Plane if plane in found}
+        lambda waves: {plane: waves[plane] for plane in Plane if plane in waves}
     )
 
 
@@ -99,9 +99,9 @@ def test_whatever_can_be_read_can_be_run(gait):
 def test_the_defaults_are_those_of_the_manual():
     gait, faults = read(f'kind = "oscillators"\n{WAVE}lag = 0.5\n')
     assert (gait.planes, faults) == ({Plane.VERTICAL: OscillatorChain(0.3, 0.5, 0.5)}, {})
-    one = gait.planes[Plane.VERTICAL]
-    assert (one.oscillator, one.forward, one.backward) == ("phase", 5.0, 5.0)
-    assert (one.approach_rate, one.attraction, one.feedback) == (4.0, 5.0, 0.0)
+    wave = gait.planes[Plane.VERTICAL]
+    assert (wave.oscillator, wave.forward, wave.backward) == ("phase", 5.0, 5.0)
+    assert (wave.approach_rate, wave.attraction, wave.feedback) == (4.0, 5.0, 0.0)
     gait, _ = read(f'kind = "delay-blocks"\n{WAVE}delay_s = 0.1\n')
     assert gait == DelayBlocks({Plane.VERTICAL: DelayLine(0.3, 0.5, 0.1)}, 2.0)
 

@@ -104,7 +104,7 @@ def test_without_ground():
 
 
 def test_all_faults_are_listed_at_once():
-    found = faults_of(
+    faults = faults_of(
         """
         description = 3
         robot = "snake31"
@@ -132,7 +132,7 @@ def test_all_faults_are_listed_at_once():
         """
     )
     check_keys(
-        found,
+        faults,
         "description robot duration_s seed epoch_s physics_rate_hz gaits gait.horizontal.amplitude "
         "gait.horizontal.frequency_hz gait.horizontal.wave gait.horizontal.lag "
         "gait.horizontal.lagg world.gravity world.surface world.ground.stiffness world.ground.law "
@@ -140,7 +140,7 @@ def test_all_faults_are_listed_at_once():
     )
     meant = {"robot": "snake13", "world.ground.law": "ellipse", "gaits": "gait"}
     for key, name in {**meant, "gait.horizontal.lagg": "lag"}.items():
-        assert f"did you mean {name}?" in found[key]
+        assert f"did you mean {name}?" in faults[key]
 
 
 @pytest.mark.parametrize(

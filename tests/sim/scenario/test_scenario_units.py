@@ -18,8 +18,8 @@ from undulog.sim.scenario.world import Ground
 def test_every_number_has_a_unit_or_is_known_to_have_none(name, report_of):
     shown = report_of("sim", "show", name)["values"]
     every = dict(leaves(tomllib.loads(load_scenario(name).toml())))
-    assert {key: one["value"] for key, one in shown.items()}.items() <= every.items()
-    assert all(one["unit"] is not None for one in shown.values())
+    assert {key: entry["value"] for key, entry in shown.items()}.items() <= every.items()
+    assert all(entry["unit"] is not None for entry in shown.values())
 
 
 @pytest.mark.parametrize(

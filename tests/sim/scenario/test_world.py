@@ -79,7 +79,7 @@ def test_a_wall_is_a_box_along_it():
 
 
 def test_faults_are_listed_at_once():
-    found = faults_of(
+    faults = faults_of(
         SNAKE13
         + """
         [world.obstacle_contact]
@@ -103,7 +103,7 @@ def test_faults_are_listed_at_once():
         """
     )
     check_keys(
-        found,
+        faults,
         "world.obstacle_contact.stiffness world.target.position world.field.count world.field.size "
         "world.field.radius world.obstacles[0].shape world.obstacles[1].radius "
         "world.obstacles[1].size world.obstacles[2].to",
@@ -115,8 +115,8 @@ def test_a_field_keeps_its_distances(seed):
     scenario = sim.parse_scenario(f"seed = {seed}\n{SNAKE13}{FIELD}", "x.toml")
     placed = scenario.world.obstacles
     assert len(placed) == 12
-    at = np.array([one.position for one in placed])
-    radius = np.array([one.radius for one in placed])
+    at = np.array([obstacle.position for obstacle in placed])
+    radius = np.array([obstacle.radius for obstacle in placed])
     assert ((radius >= 0.05) & (radius <= 0.12)).all()
     assert (np.abs(at - (1.8, 0.0)) <= (2.0, 1.5)).all()
     between = np.hypot(*(at[:, None] - at).T) - radius[:, None] - radius

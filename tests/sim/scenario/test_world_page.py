@@ -32,17 +32,17 @@ def test_the_examples_make_a_scenario():
 )
 def test_the_tables_have_all_keys_and_their_defaults(table, kind):
     rows = PAGE.split(f"| key of `[{table}]` |")[1].split("\n\n")[0].splitlines()[2:]
-    found = {}
+    defaults = {}
     for row in rows:
         key, _, default, _ = (cell.strip() for cell in row.strip("|").split("|"))
-        found[key.strip("`")] = default.strip("`")
-    assert set(found) == {item.name for item in dataclasses.fields(kind)}
+        defaults[key.strip("`")] = default.strip("`")
+    assert set(defaults) == {item.name for item in dataclasses.fields(kind)}
     for item in dataclasses.fields(kind):
         if item.default is dataclasses.MISSING:
-            assert found[item.name] == ""
+            assert defaults[item.name] == ""
         elif item.default is None:
-            assert found[item.name] == "the scenario's"
+            assert defaults[item.name] == "the scenario's"
         elif isinstance(item.default, tuple):
-            assert eval(found[item.name]) == list(item.default)
+            assert eval(defaults[item.name]) == list(item.default)
         else:
-            assert float(found[item.name]) == item.default
+            assert float(defaults[item.name]) == item.default

@@ -69,15 +69,15 @@ def test_every_message_is_what_cantools_encodes(robot, database):
     expected["acceleration"] = {"x": -9.81 / g, "y": 0.5 / g, "z": 19.6 / g}
     expected["magnetic_field"] = {"x": 20.0, "y": -12.0}
     frames = ReplyEncoder(robot).frames(samples, clock_ns)
-    found = {}
+    payloads = {}
     for frame in frames:
         message = database.get_message_by_frame_id(int(frame["id_flags"]))
         assert (int(frame["dlc"]), int(frame["dir"])) == (message.length, DIR_RX)
-        found[message.name] = frame["data"].tobytes()[: message.length]
+        payloads[message.name] = frame["data"].tobytes()[: message.length]
     rx = {s.message for s in robot.bus.signals if s.direction is Direction.RX}
-    assert set(found) == set(expected) == rx
+    assert set(payloads) == set(expected) == rx
     for name, values in expected.items():
-        assert found[name] == database.encode_message(name, values), name
+        assert payloads[name] == database.encode_message(name, values), name
 
 
 def test_each_frame_has_the_time_of_its_sample(robot):
@@ -93,10 +93,10 @@ def test_sensors_of_one_frame_read_at_different_times_have_a_frame_each(robot):
     assert frames["t_device_ns"].tolist() == [47_000_000, 57_000_000]
     assert frames["id_flags"].tolist() == [769, 769]
     decoded, _ = BusDecoder(robot).decode(frames)
-    known = {one.signals[0].target: one.values.tolist() for one in decoded}
+    by_target = {batch.signals[0].target: batch.values.tolist() for batch in decoded}
     nan = math.nan
-    np.testing.assert_allclose(known["ir01"], [0.5, nan])
-    np.testing.assert_allclose(known["ir04"], [nan, 0.7])
+    np.testing.assert_allclose(by_target["ir01"], [0.5, nan])
+    np.testing.assert_allclose(by_target["ir04"], [nan, 0.7])
 
 
 def test_a_frame_of_several_joints_has_the_time_of_the_last():

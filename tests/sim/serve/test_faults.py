@@ -116,24 +116,24 @@ kind = "noise"
 value = 0.1
 until_s = 3
 """
-    found = faults_of(BASE + text)
+    faults = faults_of(BASE + text)
     check_keys(
-        found,
+        faults,
         "faults[0].joint faults[0].value faults[1].joint faults[1].for_s faults[2].joint "
         "faults[2].value faults[2].from_s faults[3].kind faults[4].until_s",
     )
-    assert "did you mean joint07?" in found["faults[0].joint"]
-    assert "leave it out: bus-off is of the whole bus" in found["faults[1].joint"]
-    assert "leave it out: stuck has no number" in found["faults[2].value"]
+    assert "did you mean joint07?" in faults["faults[0].joint"]
+    assert "leave it out: bus-off is of the whole bus" in faults["faults[1].joint"]
+    assert "leave it out: stuck has no number" in faults["faults[2].value"]
 
 
 def test_a_run_without_a_bus_says_that_it_has_no_faults_of_one(tmp_path, opened):
     scenario = parse_scenario(BASE + '[[faults]]\nkind = "noise"\nvalue = 0.1\n', "noisy.toml")
     plain = load_scenario("flat").changed(duration_s=0.05)
     logs = {}
-    for one in (scenario, plain):
-        path = tmp_path / f"{one.name}.mcap"
-        record(one, path)
-        logs[one.name] = [message.msg for _, message in opened(path).messages("/rosout")]
+    for variant in (scenario, plain):
+        path = tmp_path / f"{variant.name}.mcap"
+        record(variant, path)
+        logs[variant.name] = [message.msg for _, message in opened(path).messages("/rosout")]
     assert "the scenario's faults are those of a bus, which this run does not have" in logs["noisy"]
     assert not any("fault" in text for text in logs["flat"])

@@ -80,7 +80,9 @@ def test_the_vendors_sdk_drives_it_and_a_second_adapter_records_it(tmp_path, ser
         stamps = [m.header.stamp for _, m in session.messages("/joint_commands")]
     np.testing.assert_allclose(command, (np.array(sent) - 2048) * STEP, atol=1e-9)
     rounds = iter(np.rint(position / STEP + 2048).astype(int).tolist())
-    assert all(any(own == each for own in rounds) for each in answered), "a reply is not recorded"
+    assert all(any(cycle == reply for cycle in rounds) for reply in answered), (
+        "a reply is not recorded"
+    )
     assert len(position) == len(volts) == 200
     writes = (raw["id_flags"] == 0xFE) & (raw["data"][:, 4] == 0x83)
     times_ns = np.maximum.accumulate(raw["t_host_ns"])[writes]  # none before one that came before

@@ -37,10 +37,10 @@ def test_any_way_of_cutting_what_a_client_sends_gives_the_same(pieces, seed):
     rng = np.random.default_rng(seed)
     cuts = np.sort(rng.integers(0, len(stream) + 1, rng.integers(0, 20))).tolist()
     text = ClientText()
-    found = []
+    parsed = []
     for start, stop in itertools.pairwise([0, *cuts, len(stream)]):
-        found += text.feed(stream[start:stop])
-    assert found == whole
+        parsed += text.feed(stream[start:stop])
+    assert parsed == whole
 
 
 @pytest.mark.slow

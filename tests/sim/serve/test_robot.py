@@ -122,10 +122,10 @@ def running():
 def positions(robot, frames, quantity=Quantity.POSITION):
     """What frames of one cycle tell, by default angles, in the order of the joints."""
     samples, _ = BusDecoder(robot).decode(frames)
-    (found,) = [sample for sample in samples if sample.signals[0].quantity is quantity]
-    order = [robot.joint_names.index(found.signals[k].target) for k in found.member]
+    (chosen,) = [sample for sample in samples if sample.signals[0].quantity is quantity]
+    order = [robot.joint_names.index(chosen.signals[k].target) for k in chosen.member]
     angles = np.full(JOINTS, np.nan)
-    angles[order] = found.values
+    angles[order] = chosen.values
     return angles
 
 
@@ -150,18 +150,18 @@ def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario,
     truth = [sample.position for sample in sensed(scenario, Controller())]
     live = running(scenario, lockstep=True)
     unknown = np.full(JOINTS, np.nan)
-    found = []
+    replies = []
     for tick in range(scenario.tick_count):
         if tick >= 2:
-            found.append(live.replies(JOINTS))
-        live.command(answer(positions(robot, found[-1]) if found else unknown, tick))
-    found += [live.replies(JOINTS), live.replies(JOINTS)]
+            replies.append(live.replies(JOINTS))
+        live.command(answer(positions(robot, replies[-1]) if replies else unknown, tick))
+    replies += [live.replies(JOINTS), live.replies(JOINTS)]
     served = live.ended()
     assert (served.complete, served.commands) == (True, JOINTS * scenario.tick_count)
-    angles = np.array([positions(robot, frames) for frames in found])
+    angles = np.array([positions(robot, frames) for frames in replies])
     np.testing.assert_allclose(angles, truth, rtol=0, atol=1e-12)
-    times = np.array([frames["t_device_ns"].astype(np.int64) for frames in found])
-    expected = PERIOD_NS * np.arange(len(found))[:, None] + 500_000 * np.arange(JOINTS)
+    times = np.array([frames["t_device_ns"].astype(np.int64) for frames in replies])
+    expected = PERIOD_NS * np.arange(len(replies))[:, None] + 500_000 * np.arange(JOINTS)
     expected[-1] = expected[-1, 0]  # the end of the run has no turns any more
     assert np.array_equal(times - times[0, 0], expected)
 
@@ -190,7 +190,7 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, run
     for frames in resting:  # straight, whatever it has been commanded by then
         np.testing.assert_array_equal(positions(robot, frames), np.zeros(JOINTS))
     # The last pose at rest is sent at tick 1, the first cycle at tick 2.
-    times = np.array([int(one["t_device_ns"][0]) for one in resting])
+    times = np.array([int(reply["t_device_ns"][0]) for reply in resting])
     assert times[-1] == served.start_ns - 1000
     assert (np.diff(times) > 0).all()
     frames = np.concatenate([first, live.replies(30 * JOINTS)])

@@ -158,10 +158,10 @@ def test_over_the_bus_come_the_same_columns_to_within_half_a_step_of_the_dbc(run
     assert run.end["unix_refused"] == run.end["dropped_clients"] == 0
     with Session.open(run.in_process) as truth:
         for path in run.over_bus.values():
-            with Session.open(path) as found:
+            with Session.open(path) as recorded:
                 for (topic, field), step in STEP.items():
                     names, expected, _ = columns(truth, topic, field)
-                    own_names, values, _ = columns(found, topic, field)
+                    own_names, values, _ = columns(recorded, topic, field)
                     assert own_names == names
                     assert values.shape == expected.shape == (25, 301)
                     assert np.abs(values - expected).max() <= step / 2 * (1 + 1e-9), topic
@@ -172,10 +172,10 @@ def test_sensors_come_over_the_bus_too(run):
     with Session.open(run.in_process) as truth:
         topics = {sensor.topic: sensor for sensor in truth.robot.sensors}
         for path in run.over_bus.values():
-            with Session.open(path) as found:
-                assert set(topics) <= set(found.channels)
+            with Session.open(path) as recorded:
+                assert set(topics) <= set(recorded.channels)
                 for topic in topics:
-                    expected, values = truth.table(topic), found.table(topic)
+                    expected, values = truth.table(topic), recorded.table(topic)
                     assert len(values) == len(expected) > 0, topic
                     for column, step in SENSOR_COLUMNS[topics[topic].kind].items():
                         np.testing.assert_allclose(
@@ -198,9 +198,9 @@ def test_times_over_the_bus_are_those_of_the_run(run, opened):
     _, _, expected = columns(opened(run.in_process), "/joint_states", "position")
     expected = expected - expected.min()
     for way, path in run.over_bus.items():
-        with Session.open(path) as found:
-            frames = found.frames("/can/can0")
-            _, _, mapped = columns(found, "/joint_states", "position")
+        with Session.open(path) as recorded:
+            frames = recorded.frames("/can/can0")
+            _, _, mapped = columns(recorded, "/joint_states", "position")
         states = frames[(frames["id_flags"] >= 513) & (frames["id_flags"] <= 537)]
         device = states["t_device_ns"].astype(np.int64).reshape(-1, 25).T
         gap = device - start_ns - expected

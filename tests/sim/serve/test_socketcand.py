@@ -114,9 +114,9 @@ def test_what_the_server_writes_both_clients_read_alike():
     truth = traffic(500, 0)
     text = frame_text(truth)
     tally = Tally(lambda: 0)
-    found = SocketcandText().feed(text, 5, tally)
-    assert same(found, truth)
-    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    decoded = SocketcandText().feed(text, 5, tally)
+    assert same(decoded, truth)
+    assert np.array_equal(decoded["t_device_ns"], truth["t_device_ns"])
     pieces = [piece + ">" for piece in text.decode().split(">")[:-1]]
     assert same(frames_of([convert_ascii_message_to_can_message(piece) for piece in pieces]), truth)
     odd = empty_frames(2)
@@ -153,8 +153,8 @@ def test_remote_requests_have_a_length_and_no_data():
     record = sent_frame("sendrtr", "1AAAAAAA 2")
     assert record is not None
     (frame,) = records([record])
-    found = frame["id_flags"], frame["dlc"], frame["data"].any()
-    assert found == (0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG, 2, False)
+    fields = frame["id_flags"], frame["dlc"], frame["data"].any()
+    assert fields == (0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG, 2, False)
     assert sent_frame("sendrtr", "123 1 22") is None
 
 
@@ -162,12 +162,12 @@ def test_remote_requests_have_a_length_and_no_data():
 
 
 def test_frames_go_to_everyone_but_their_sender(serving):
-    own, other = traffic(300, 0), traffic(200, 0)
+    ours, other = traffic(300, 0), traffic(200, 0)
     with peer(serving) as first, peer(serving) as second:
         wait_for(lambda: serving.raw() == 2, "two clients")
-        serving.send(own)
-        assert same(received(first, 300)[1], own)
-        assert same(received(second, 300)[1], own)
+        serving.send(ours)
+        assert same(received(first, 300)[1], ours)
+        assert same(received(second, 300)[1], ours)
         for frame in other:
             first.send(can_message(frame))
         messages, frames = received(second, 200)
@@ -179,7 +179,7 @@ def test_frames_go_to_everyone_but_their_sender(serving):
 
 
 def test_our_own_source_records_the_bus(serving, tmp_path):
-    own, other = traffic(300, 0), traffic(100, 0)
+    ours, other = traffic(300, 0), traffic(100, 0)
     source = open_source(parse_address(f"can:socketcand:can0?port={serving.port}"))
     clock = SessionClock()
     with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=clock.epoch_ns) as writer:
@@ -187,7 +187,7 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
         try:
             wait_for(lambda: serving.raw() == 1, "our source")
             arrays = []
-            serving.send(own)
+            serving.send(ours)
             with peer(serving) as foreign:
                 for frame in other:
                     foreign.send(can_message(frame))
@@ -199,15 +199,15 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
                 wait_for(enough, "all frames")
         finally:
             source.stop()
-    found = np.concatenate(arrays)
-    assert same(found, np.concatenate([own, other]))
-    assert np.array_equal(found["t_device_ns"][:300], own["t_device_ns"])
+    recorded = np.concatenate(arrays)
+    assert same(recorded, np.concatenate([ours, other]))
+    assert np.array_equal(recorded["t_device_ns"][:300], ours["t_device_ns"])
     assert source.counts.malformed == 0
 
 
 def test_pythons_client_can_join_a_busy_bus(serving):
-    own = traffic(20, 0)
-    with repeating(lambda: serving.send(own), 0.001):
+    ours = traffic(20, 0)
+    with repeating(lambda: serving.send(ours), 0.001):
         for _ in range(10):
             with peer(serving) as bus:
                 assert bus.recv(PATIENCE_S) is not None
@@ -242,12 +242,12 @@ def test_answers_are_those_of_the_protocol(serving):
 
 @pytest.mark.slow
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
-    own = traffic(1000, 0)
+    ours = traffic(1000, 0)
     with hand(serving, b"open can0", b"rawmode"), peer(serving) as good:
         wait_for(lambda: serving.raw() == 2, "two clients")
         sent = 0
         while not serving.server.dropped:
-            serving.send(own)
+            serving.send(ours)
             sent += 1000
             assert len(received(good, 1000)[1]) == 1000
             assert sent < 2_000_000
@@ -288,7 +288,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
     serving, monkeypatch
 ):
     monkeypatch.setattr(socketcand_server, "HOLD_S", 0.0)
-    own = traffic(40, 0)
+    ours = traffic(40, 0)
     with serving.lock:
         serving.pulling = False
         serving.server.identity = "virtual-robot snake25 paced"
@@ -298,14 +298,14 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
     with serving.lock:  # the robot does not listen
         # It sent more than the controller has read, so that the end resets the connection; and it
         # sends again before it listens.
-        serving.server.broadcast(own)
-        link.send(own)
+        serving.server.broadcast(ours)
+        link.send(ours)
         link.close()
         for _ in range(3):
-            serving.server.broadcast(own)
+            serving.server.broadcast(ours)
         assert serving.server.waiting == 0
     wait_for(lambda: not any(c.bus_open for c in serving.server._clients.values()))
-    assert same(records(one.record for one in iter(serving.server.take, None)), own)
+    assert same(records(command.record for command in iter(serving.server.take, None)), ours)
     link.close()  # again, and nothing happens
 
 
@@ -329,10 +329,10 @@ def test_silent_clients_lock_nobody_out(serving, words):
         late = clients.enter_context(peer(serving))
         wait_for(lambda: serving.raw() == 2, "both in raw mode")
         serving.send(frames)
-        _, found = received(late, len(frames))
+        _, heard = received(late, len(frames))
         text = frame_text(frames)
         assert read_until(worker, text[-40:]) == text
-    assert same(found, frames)
+    assert same(heard, frames)
 
 
 def test_only_loopback_is_served():

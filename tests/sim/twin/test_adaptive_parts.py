@@ -204,14 +204,14 @@ def test_the_random_walk_draws_from_its_own_stream():
         course = RandomHeadingPolicy(RandomTurns(0.15, 2.0, 6.0), seed)
         return np.array([course.step(moment(k / 100)) for k in range(20000)])
 
-    one = offsets(7)
-    np.testing.assert_array_equal(one, offsets(7))
-    assert (one != offsets(8)).any()
-    held = np.diff(np.flatnonzero(np.diff(one))) / 100
+    walk = offsets(7)
+    np.testing.assert_array_equal(walk, offsets(7))
+    assert (walk != offsets(8)).any()
+    held = np.diff(np.flatnonzero(np.diff(walk))) / 100
     assert held.min() > 2.0 - 0.02
     assert held.max() < 6.0 + 0.02
-    assert np.abs(one).max() <= 0.15
-    drawn = one[np.flatnonzero(np.diff(one)) + 1]
+    assert np.abs(walk).max() <= 0.15
+    drawn = walk[np.flatnonzero(np.diff(walk)) + 1]
     assert abs(drawn.mean()) < 3 * 0.15 / math.sqrt(3 * len(drawn))
 
 
@@ -282,8 +282,8 @@ def test_odometry_of_a_chain_that_follows_its_path(make_robot, curve):
     cos, sin = math.cos(heading_now), math.sin(heading_now)
     truth = [cos * step[0] + sin * step[1], cos * step[1] - sin * step[0]]
     truth.append((turned - heading) / (2 * dt))
-    found = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
-    np.testing.assert_allclose(found, truth, atol=0.02 * speed)
+    estimated = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
+    np.testing.assert_allclose(estimated, truth, atol=0.02 * speed)
 
 
 def test_odometry_of_a_body_that_holds_its_shape(make_robot):

@@ -127,10 +127,10 @@ def test_reckoning_and_course_lead_to_a_target_on_free_ground():
                 break
     true = np.array([sample.step.body.position[:2, 0] for sample in samples])
     values = np.array([sample.gait.values for sample in samples])
-    found = values[:, [names.index("course.x"), names.index("course.y")]]
+    reckoned = values[:, [names.index("course.x"), names.index("course.y")]]
     way = np.hypot(*np.diff(true, axis=0).T).sum()
     assert samples[-1].time_s < 11.0
-    assert np.nanmax(np.hypot(*(found - true).T)) < 0.05 * way
+    assert np.nanmax(np.hypot(*(reckoned - true).T)) < 0.05 * way
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_the_median_interval_covers_as_often_as_it_says(study):
 def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Two of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""
     limits_s = {"target-following": 90.0, "random-walk": 30.0}
-    found = study.summary(study.study(list(range(101, 103)), limits_s, 2, "numba", None))
-    assert found["target-following"]["met"] == 2
-    assert found["time_s_ratio"][0] > 3.0
-    assert found["electrical_j_ratio"][0] > 3.0
+    summary = study.summary(study.study(list(range(101, 103)), limits_s, 2, "numba", None))
+    assert summary["target-following"]["met"] == 2
+    assert summary["time_s_ratio"][0] > 3.0
+    assert summary["electrical_j_ratio"][0] > 3.0

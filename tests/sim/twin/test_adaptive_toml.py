@@ -97,11 +97,11 @@ head.k = -1.0
 lookout.half_width_m = 0.0
 course = { shortest_s = 3.0, longest_s = 2.0 }
 """
-    found = faults_of(BASE + text)
+    faults = faults_of(BASE + text)
     keys = "near_hold head.k lookout.half_width_m course.longest_s"
-    check_keys(found, " ".join(f"controller.{key}" for key in keys.split()))
-    assert "did you mean near_hold_s?" in found["controller.near_hold"]
-    assert "at least shortest_s = 3" in found["controller.course.longest_s"]
+    check_keys(faults, " ".join(f"controller.{key}" for key in keys.split()))
+    assert "did you mean near_hold_s?" in faults["controller.near_hold"]
+    assert "at least shortest_s = 3" in faults["controller.course.longest_s"]
     assert "random-walk" in faults_of(f'{BASE}[controller]\nkind = "random"')["controller.kind"]
 
 
@@ -120,13 +120,13 @@ def test_every_controller_wraps_every_generator(gait, kind):
     controlled = parsed(f'[controller]\nkind = "{kind}"')
     scenario = dataclasses.replace(controlled, gait=load_scenario(gait).gait)
     assert "steer.offset" not in build_gait(dataclasses.replace(scenario, controller=None)).names
-    one, two = build_gait(scenario), build_gait(scenario)
+    wrapped, two = build_gait(scenario), build_gait(scenario)
     nothing = Readings.nothing(scenario.robot)
     for k in range(5):
-        tick = one.step(k / 100, nothing)
+        tick = wrapped.step(k / 100, nothing)
         np.testing.assert_array_equal(tick.values, two.step(k / 100, nothing).values)
-        assert len(tick.values) == len(one.names)
-    assert "steer.offset" in one.names
+        assert len(tick.values) == len(wrapped.names)
+    assert "steer.offset" in wrapped.names
 
 
 def test_the_target_is_measured_from_magnetic_north():

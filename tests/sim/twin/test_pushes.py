@@ -38,8 +38,8 @@ def momentum(sample, robot):
 def test_a_push_gives_its_impulse(pushed, engine):
     # Along the body, which stays straight: exact, also in the middle of control periods.
     push = Push("link02", (0.3, 0.0, 0.0), start_s=0.203, duration_s=0.25)
-    found = momentum(*pushed(push, engine=engine))
-    np.testing.assert_allclose(found, [0.075, 0.0, 0.0], rtol=1e-12, atol=1e-12)
+    gained = momentum(*pushed(push, engine=engine))
+    np.testing.assert_allclose(gained, [0.075, 0.0, 0.0], rtol=1e-12, atol=1e-12)
 
 
 def test_a_push_that_bends_the_body_converges_to_its_impulse(pushed):
@@ -68,9 +68,9 @@ def test_its_work_is_on_the_ledger(pushed):
 
 
 def test_two_pushes_on_one_link_add_up(pushed):
-    one = pushed(Push("link03", (0.2, 0.0, 0.0), 0.2, 0.3))[0]
+    alone = pushed(Push("link03", (0.2, 0.0, 0.0), 0.2, 0.3))[0]
     two = pushed(*[Push("link03", (0.1, 0.0, 0.0), 0.2, 0.3)] * 2)[0]
-    np.testing.assert_array_equal(one.step.body.velocity, two.step.body.velocity)
+    np.testing.assert_array_equal(alone.step.body.velocity, two.step.body.velocity)
 
 
 def test_a_push_is_read_and_written_back():

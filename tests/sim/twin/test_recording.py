@@ -214,17 +214,24 @@ def test_clamps_limits_and_stiff_parts_come_once(tmp_path, make_scenario, make_r
 
 def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, truth):
     noisy = dataclasses.replace(scenario, noise=sim.Noise(position=0.01))
-    found = {}
+    angles_by_seed = {}
     for seed in (1, 2):
         path = tmp_path / f"{seed}.mcap"
         sim.record(noisy.changed(seed=seed), path)
         with Session.open(path) as session:
-            found[seed] = columns(session, "/joint_states")
+            angles_by_seed[seed] = columns(session, "/joint_states")
             velocity = columns(session, "/joint_states", "velocity")
             energy = columns(session, "/energy_ledger")
     angles = np.array([sample.step.body.angle for sample in truth])
-    assert np.std(found[1] - angles) == pytest.approx(0.01, rel=0.05)
-    assert np.abs(np.corrcoef((found[1] - angles).ravel(), (found[2] - angles).ravel())[0, 1]) < 0.1
+    assert np.std(angles_by_seed[1] - angles) == pytest.approx(0.01, rel=0.05)
+    assert (
+        np.abs(
+            np.corrcoef((angles_by_seed[1] - angles).ravel(), (angles_by_seed[2] - angles).ravel())[
+                0, 1
+            ]
+        )
+        < 0.1
+    )
     np.testing.assert_array_equal(velocity, [sample.step.body.rate for sample in truth])
     np.testing.assert_array_equal(energy, [sample.energy for sample in truth])
 
@@ -283,8 +290,8 @@ def test_a_stop_request_ends_between_two_samples(tmp_path, scenario):
         if sample.tick == 7:
             stop.signal = signal.SIGTERM
 
-    found = sim.record(scenario, tmp_path / "a.mcap", stop=stop, on_sample=ask)
-    assert (found.sample_count, found.duration_s, found.complete) == (8, 0.07, False)
+    outcome = sim.record(scenario, tmp_path / "a.mcap", stop=stop, on_sample=ask)
+    assert (outcome.sample_count, outcome.duration_s, outcome.complete) == (8, 0.07, False)
 
 
 PEG = '[[world.obstacles]]\nshape = "cylinder"\nposition = [0.0, 0.08]\nradius = 0.05\n'

@@ -133,14 +133,14 @@ def test_every_edit_keeps_the_record(folder, tmp_path, command, report_of, opene
 def test_a_record_that_cant_be_used_is_reported_and_the_scenario_read(folder, tmp_path, key, text):
     with Session.open(folder / "new" / "run.mcap") as session:
         facts = {**session.metadata[RUN_RECORD], key: text}
-        scenario, robot, found = session.attachments["scenario.toml"], session.robot, session.run
+        scenario, robot, run = session.attachments["scenario.toml"], session.robot, session.run
     path = tmp_path / "odd.mcap"
     with SessionWriter(path, session_id="odd", epoch_ns=10**18, robot=robot) as writer:
         writer.note(RUN_RECORD, {name: value for name, value in facts.items() if value is not None})
         writer.attach("scenario.toml", "application/toml", scenario)
         writer.string("/gait/mode").write(10**18, "walk")
     with Session.open(path) as session:
-        assert session.run.drag_ratio == found.drag_ratio
+        assert session.run.drag_ratio == run.drag_ratio
         assert any(f"{RUN_RECORD} can't be used" in warning for warning in session.warnings)
 
 

@@ -53,10 +53,10 @@ def largest(scenario):
 @pytest.mark.parametrize("planar", [True, False], ids=["planar", "alternating"])
 def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
     # k_g and c_g in proportion, and the motor's damping small: so is the share.
-    one = largest(nudged(links, planar=planar))
+    limit = largest(nudged(links, planar=planar))
 
     def scaled(share):
-        gear = {"gear_stiffness": 40.0 * share / one, "gear_damping": 0.05 * share / one}
+        gear = {"gear_stiffness": 40.0 * share / limit, "gear_damping": 0.05 * share / limit}
         return nudged(links, planar=planar, **gear)
 
     assert largest(scaled(0.97)) == pytest.approx(0.97, abs=1e-3)
@@ -77,13 +77,13 @@ def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
 )
 def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
     # Thrown flat on the ground with a little speed all ways.
-    def scaled(share, one=1.0):
-        field = {name: getattr(ground, name) * share / one}
+    def scaled(share, limit=1.0):
+        field = {name: getattr(ground, name) * share / limit}
         world = sim.World(velocity=(1e-4, 1e-4, -1e-4), ground=dataclasses.replace(ground, **field))
         return nudged(3, planar=False, world=world, gear_stiffness=1.0, gear_damping=1e-4)
 
-    one = largest(scaled(1.0))
-    calm, wild = scaled(0.95, one), scaled(1.05, one)
+    limit = largest(scaled(1.0))
+    calm, wild = scaled(0.95, limit), scaled(1.05, limit)
     assert largest(calm) == pytest.approx(0.95, abs=0.01)
     assert restless(calm) < 1e-3
     assert not restless(wild) < 3e-3  # not much where the links leave the ground
@@ -92,7 +92,7 @@ def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
 
 def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
     # Two links with a loose gear: 1 / mass at the end, from free links and the joint between them.
-    def found(material):
+    def margin(material):
         world = dataclasses.replace(
             IN_SPACE, obstacles=(sim.Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
         )
@@ -106,12 +106,12 @@ def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
     held = free @ joint
     give = end @ free @ end - (end @ held) ** 2 / (joint @ held)
     expected = (2e-3 * 5.0 + 1e-6 * 3e4) * give / 4
-    assert found(material).share == pytest.approx(expected, rel=1e-6)
-    assert found(material).stiffest == "world.obstacle_contact.stiffness"
+    assert margin(material).share == pytest.approx(expected, rel=1e-6)
+    assert margin(material).stiffest == "world.obstacle_contact.stiffness"
     # Friction stops the free link's end, 39 mm from its centre, within a step: 2 dt c = 2 m.
     friction = 2.0 / (1 / 0.1 + (0.03**2 + 0.025**2) / 4e-5) * give / 4
     rough = dataclasses.replace(material, mu=0.3)
-    assert found(rough).share == pytest.approx(expected + friction, rel=1e-6)
+    assert margin(rough).share == pytest.approx(expected + friction, rel=1e-6)
 
 
 def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot):

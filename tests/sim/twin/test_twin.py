@@ -82,8 +82,8 @@ def test_the_ledger_agrees_with_the_logged_torques(make_scenario, make_robot):
     # The same energies from 100 Hz samples: E_net = sum of the integral of tau q'.
     with Twin(make_scenario(make_robot(9, stall_torque=0.25), duration_s=4.0)) as twin:
         samples = list(twin.samples())
-        sensed = [one for sample in samples for one in sample.sensed] + twin.flush()
-    joints = [one for one in sensed if isinstance(one, JointSample)]
+        sensed = [reading for sample in samples for reading in sample.sensed] + twin.flush()
+    joints = [reading for reading in sensed if isinstance(reading, JointSample)]
     assert len(joints) == len(samples) == 401
     power = [(joint.effort * joint.velocity).sum() for joint in joints]
     electrical = [(joint.voltage * joint.current).sum() for joint in joints]
@@ -119,7 +119,7 @@ def test_lags_agree_with_an_independent_program(make_scenario, make_robot, respo
     yaw = robot.joint_indices(Plane.HORIZONTAL)
     commands = np.array([sample.gait.command[yaw] for sample in samples])
     angles = np.array([sample.step.body.angle[yaw] for sample in samples])
-    found = [response(c, q, 0.5) for c, q in zip(commands.T, angles.T, strict=True)]
-    lag = -np.degrees(np.angle(found))
+    responses = [response(c, q, 0.5) for c, q in zip(commands.T, angles.T, strict=True)]
+    lag = -np.degrees(np.angle(responses))
     assert lag[[0, -1]].mean() == pytest.approx(7.46, abs=0.01)
     assert lag[4:9].mean() == pytest.approx(13.66, abs=0.01)

@@ -112,9 +112,9 @@ def test_both_engines_meet_the_same_obstacles(forest):
 def test_obstacles_out_of_reach_change_nothing(make_scenario, make_robot):
     scenario = make_scenario(make_robot(9), ramp_s=0.2, duration_s=0.3)
     far = dataclasses.replace(scenario, world=World(obstacles=(Cylinder((5.0, 0.0), 0.1),)))
-    for one, other in zip(simulate(scenario), simulate(far), strict=True):
-        np.testing.assert_array_equal(one.step.body.position, other.step.body.position)
-        np.testing.assert_array_equal(one.energy, other.energy)
+    for sample, other in zip(simulate(scenario), simulate(far), strict=True):
+        np.testing.assert_array_equal(sample.step.body.position, other.step.body.position)
+        np.testing.assert_array_equal(sample.energy, other.energy)
 
 
 def test_the_command_line_shows_the_time_in_contact(tmp_path, command, report_of):
@@ -126,7 +126,7 @@ def test_the_command_line_shows_the_time_in_contact(tmp_path, command, report_of
     assert touched
     assert all(0.0 < seconds <= 0.3 for seconds in touched.values())
     longest = max(touched, key=touched.get)
-    found = command("sim", "run", path, *words).out
-    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in found
+    output = command("sim", "run", path, *words).out
+    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in output
     path.write_text(text.replace("0.06]", "2.0]"))
     assert "no link touched an obstacle\n" in command("sim", "run", path, *words).out
