@@ -30,7 +30,7 @@ class Bag:
 
     def write(self, topic, t_ns, names, *fields):
         values = zip(("position", "velocity", "effort"), fields, strict=False)
-        content = {name: np.asarray(one, dtype=float).tolist() for name, one in values}
+        content = {name: np.asarray(field, dtype=float).tolist() for name, field in values}
         self.messages.append((topic, int(t_ns), joint_state(int(t_ns), list(names), **content)))
 
     def write_both(self, t_ns, names, command, *response):

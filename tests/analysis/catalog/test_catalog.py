@@ -294,8 +294,8 @@ def _write_many(arguments):
     catalog = Catalog(folder)
     result = json.loads((Path(folder) / "day1" / "gait.json").read_text())
     for k in range(results):
-        own = result | {"session": result["session"] | {"id": f"{number}-{k}"}}
-        catalog.add_result(f"{number}-{k}", own)
+        changed = result | {"session": result["session"] | {"id": f"{number}-{k}"}}
+        catalog.add_result(f"{number}-{k}", changed)
     catalog.scan()
     return number
 
@@ -349,9 +349,9 @@ def test_wrong_places_and_conditions_are_refused(lab):
 
 @pytest.mark.slow
 def test_the_command(lab, command, report_of):
-    found = report_of("catalog", lab, "--where", "status = 'analysed'")
-    assert [row["path"] for row in found["rows"]] == ["day1/gait.mcap"]
-    assert found["scan"]["read"] == 4
+    report = report_of("catalog", lab, "--where", "status = 'analysed'")
+    assert [row["path"] for row in report["rows"]] == ["day1/gait.mcap"]
+    assert report["scan"]["read"] == 4
     text = command("catalog", lab).out
     assert "plain.mcap" in text
     assert "2 rows; 2 sessions, 0 files read now" in text

@@ -28,9 +28,9 @@ KINDS = {
 BAGS = ["alone.db3", *sorted(f"day/{name}" for name in KINDS)]
 
 
-def _joints(own, *tick):
-    own.controller(*tick)
-    own.state(*tick)
+def _joints(writer, *tick):
+    writer.controller(*tick)
+    writer.state(*tick)
 
 
 @pytest.fixture

@@ -63,7 +63,7 @@ def test_one_joint_does_not_move_the_others():
     moved = values.copy()
     moved[20:, 2] -= 3.0
     nothing = np.zeros(40, dtype=np.int64)
-    before, after = (relative_to_others(one, nothing) for one in (values, moved))
+    before, after = (relative_to_others(levels, nothing) for levels in (values, moved))
     assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
 
 

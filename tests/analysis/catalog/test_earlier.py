@@ -69,7 +69,7 @@ def of_robot(sessions, rows):
 def test_a_joint_of_two_sessions_differs_from_itself():
     changes = {"joint2": ("tracking_gain", -0.2), "joint4": ("offset_rad", 5.1 * DEGREE)}
     sessions, rows = frames(np.random.default_rng(1), 2, changes=changes)
-    results = {one.joint: one for one in of_robot(sessions, rows)}
+    results = {joint.joint: joint for joint in of_robot(sessions, rows)}
     assert set(results) == {"joint2", "joint4"}
     low, high = results["joint4"].change_ci95
     assert low < 5.1 * DEGREE < high < low + 0.3 * DEGREE

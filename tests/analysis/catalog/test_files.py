@@ -36,8 +36,8 @@ def scanned(tmp_path_factory):
     catalog.scan()
     plain = catalog.find().set_index("path").session_id["plain.mcap"]
     facts = result.to_dict()
-    own = facts | {"session": facts["session"] | {"id": plain}}
-    catalog.add_result("analysis of plain.mcap", json.loads(json.dumps(own)))
+    renamed = facts | {"session": facts["session"] | {"id": plain}}
+    catalog.add_result("analysis of plain.mcap", json.loads(json.dumps(renamed)))
     return folder
 
 
@@ -100,10 +100,10 @@ def test_a_damaged_file_is_set_aside_and_its_rows_are_read_again(lab, kind, dama
         assert len(list((whole / FOLDER / "damaged").iterdir())) == 1
         columns = ["path", "session_id", "robot", "messages", "start"]
         pd.testing.assert_frame_equal(catalog.find()[columns], before[columns])
-        found = status_of(catalog)
-        assert found["gait.mcap"] == "analysed"  # its result is a file
+        statuses = status_of(catalog)
+        assert statuses["gait.mcap"] == "analysed"  # its result is a file
         joints = catalog.find("path = 'plain.mcap'", joints=True)
-        assert (found["plain.mcap"] == "analysed") == (len(joints) > 0)
+        assert (statuses["plain.mcap"] == "analysed") == (len(joints) > 0)
         assert Catalog(str(whole)).scan().set_aside == ()
         assert Catalog(str(whole)).scan().read == 0
 

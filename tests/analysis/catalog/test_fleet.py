@@ -39,8 +39,8 @@ def frames(seed, kind="none", *, size=0.05, n=60, joints=13, gaits=1):
     at, worn = int(rng.integers(10, n - 10)), int(rng.integers(joints))
     begun = (days[at - 1] + days[at]) / 2
 
-    def values(mean, own, shared, noise):
-        of_joints = mean + own * rng.normal(size=joints)
+    def values(mean, alone, shared, noise):
+        of_joints = mean + alone * rng.normal(size=joints)
         of_sessions = shared * rng.normal(size=n)[:, None]
         return of_joints + of_sessions + noise * rng.normal(size=(n, joints))
 
@@ -257,7 +257,7 @@ def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
         sessions, rows, name, begun = frames(seed, kind, size=0.06)
         changes = analyse_fleet(sessions, rows).robots[0].changes
         mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
-        good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
+        good += any(change.earliest <= begun.isoformat() <= change.latest for change in mine)
     assert good >= {"step": 45, "ramp": 28, "saturating": 42}[kind]
 
 

@@ -104,7 +104,7 @@ LONG_OR_SIMILAR = (
     [
         ("select list(x) from range(1000000000) t(x)", "memory"),
         ("with recursive t as (select 'x' n union all select n || n from t) from t", "memory"),
-        *(pytest.param(*each, marks=pytest.mark.nightly) for each in LONG_OR_SIMILAR),
+        *(pytest.param(*case, marks=pytest.mark.nightly) for case in LONG_OR_SIMILAR),
     ],
 )
 def test_memory_and_time_of_a_query_are_bounded(lab, query, why):

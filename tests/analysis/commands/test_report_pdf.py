@@ -25,15 +25,15 @@ def pages(pdf):
 
 def processes_of(folder):
     """Running processes whose command line names a folder."""
-    found = []
-    for each in Path("/proc").iterdir():
-        if each.name.isdigit():
+    numbers = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
             try:
-                if str(folder).encode() in (each / "cmdline").read_bytes():
-                    found.append(each.name)
+                if str(folder).encode() in (entry / "cmdline").read_bytes():
+                    numbers.append(entry.name)
             except OSError:
                 continue
-    return found
+    return numbers
 
 
 def script(folder, text):
@@ -80,23 +80,23 @@ def test_the_browser_asks_no_network(chromium, tmp_path, command):
     with_log = script(tmp_path, f'exec {chromium} --log-net-log={log} "$@"')
     command("report", GOLDEN, "--pdf", tmp_path / "run.pdf", "--browser", with_log)
     # Chromium's own log of its network stack.
-    found = json.loads(log.read_text())
-    names = {number: name for name, number in found["constants"]["logEventTypes"].items()}
-    events = [(names[one["type"]], one.get("params", {})) for one in found["events"]]
+    netlog = json.loads(log.read_text())
+    names = {number: name for name, number in netlog["constants"]["logEventTypes"].items()}
+    events = [(names[event["type"]], event.get("params", {})) for event in netlog["events"]]
     assert events
     kinds = {name for name, _ in events}
     assert not kinds & {"UDP_BYTES_SENT", "SOCKET_BYTES_SENT", "HOST_RESOLVER_DNS_TASK"}
     tried = {str(facts) for name, facts in events if name == "TCP_CONNECT_ATTEMPT"}
-    assert all("127.0.0.1:9" in one for one in tried if "address" in one)
+    assert all("127.0.0.1:9" in request for request in tried if "address" in request)
 
 
 def test_without_a_browser_the_message_says_what_to_do(tmp_path, monkeypatch, command):
     monkeypatch.setenv("PATH", str(tmp_path))
-    said = command("report", GOLDEN, "--pdf", tmp_path / "run.pdf", code=2).err
-    assert all(word in said for word in ("chromium", "--browser", "UNDULOG_BROWSER", "by hand"))
+    error = command("report", GOLDEN, "--pdf", tmp_path / "run.pdf", code=2).err
+    assert all(word in error for word in ("chromium", "--browser", "UNDULOG_BROWSER", "by hand"))
     monkeypatch.setenv("UNDULOG_BROWSER", "no-such-browser")
-    said = command("report", GOLDEN, "--pdf", tmp_path / "run.pdf", code=2).err
-    assert "UNDULOG_BROWSER: there is no program no-such-browser" in said
+    error = command("report", GOLDEN, "--pdf", tmp_path / "run.pdf", code=2).err
+    assert "UNDULOG_BROWSER: there is no program no-such-browser" in error
     assert list(tmp_path.iterdir()) == []
 
 
@@ -112,8 +112,8 @@ def test_a_browser_that_fails_leaves_nothing(text, expected, short, tmp_path, co
     out = tmp_path / "out"
     out.mkdir()
     failing = script(tmp_path, text)
-    said = command("report", short, "--pdf", out / "x.pdf", "--browser", failing, code=1).err
-    assert expected in said
+    error = command("report", short, "--pdf", out / "x.pdf", "--browser", failing, code=1).err
+    assert expected in error
     assert list(out.iterdir()) == []
 
 

@@ -32,11 +32,11 @@ def test_analyse_of_a_folder_is_a_table_and_a_list_of_results(folder, tmp_path, 
     assert "unlike" in lines[1]
     assert lines[2].startswith("bad.mcap")
     output = tmp_path / "all.json"
-    found = json.loads(command("analyse", folder, "--json", "-o", output, code=1).out)
-    assert json.loads(output.read_text()) == found
+    results = json.loads(command("analyse", folder, "--json", "-o", output, code=1).out)
+    assert json.loads(output.read_text()) == results
     alone = json.loads(command("analyse", folder / "a.mcap", "--json").out)
-    assert found[0] == alone
-    assert "not an MCAP file" in found[1]["error"]
+    assert results[0] == alone
+    assert "not an MCAP file" in results[1]["error"]
 
 
 @pytest.mark.slow
@@ -83,8 +83,8 @@ def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
     assert set(re.findall(r'href="#([^"]+)"', text)) <= {*ids}
     assert "not an MCAP file" in index
     assert text.index('class="index"') < text.index('id="s1-answer"') < text.index('id="s2-answer"')
-    found = json.loads(command("analyse", folder / "a.mcap", "--json").out)
-    first = found["answer"]["sentence"].partition(". ")[0].partition(" [")[0]
+    report = json.loads(command("analyse", folder / "a.mcap", "--json").out)
+    first = report["answer"]["sentence"].partition(". ")[0].partition(" [")[0]
     assert first in index.replace("\N{NO-BREAK SPACE}", " ")
     levels = [int(level) for level in re.findall(r"<h([1-6])", text)]
     assert levels[0] == levels.count(1) == 1
@@ -94,11 +94,11 @@ def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
 @pytest.mark.nightly
 def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, command):
     files = folder / "a.mcap", folder / "sub/a.mcap"
-    one, each = tmp_path / "one.html", tmp_path / "each.html"
-    assert command("report", *files, "-o", one).out.startswith("2 sessions: ")
-    command("report", *files, "--each", "-o", each)
-    assert "of one experiment" in one.read_text()
-    assert 'id="s2-answer"' in each.read_text()
+    single, every = tmp_path / "one.html", tmp_path / "each.html"
+    assert command("report", *files, "-o", single).out.startswith("2 sessions: ")
+    command("report", *files, "--each", "-o", every)
+    assert "of one experiment" in single.read_text()
+    assert 'id="s2-answer"' in every.read_text()
 
 
 @pytest.mark.nightly

@@ -45,20 +45,20 @@ def motion(amplitudes, seed, noise=NOISE, robot=None):
 
 def decided(*motions):
     common = common_motion(motions)
-    a, b = ([Side(motion_estimates(one, common))] for one in motions)
+    a, b = ([Side(motion_estimates(side_motion, common))] for side_motion in motions)
     keys = family(a, b, common.names)
     about = np.array([a[0].estimates[key][0] for key in keys])
     sides = [estimates_of(side, keys, about) for side in (a, b)]
-    first, second, found = differ(*sides, "sessions")
-    return decide(keys, first, second, found, Margins(), before=common.before)
+    first, second, differences = differ(*sides, "sessions")
+    return decide(keys, first, second, differences, Margins(), before=common.before)
 
 
 def false_alarms(amplitudes, draws):
     """Share of pairs of one motion in which something differs beyond doubt."""
-    found = [
+    results = [
         decided(motion(amplitudes, 2 * k), motion(amplitudes, 2 * k + 1)) for k in range(draws)
     ]
-    return np.mean([any(d.p_holm < 0.05 for d in one.differences) for one in found])
+    return np.mean([any(d.p_holm < 0.05 for d in result.differences) for result in results])
 
 
 WEAK = WAVE * np.array([1, 1, 1, 0.003, 1, 1])  # one joint barely above its noise
@@ -84,8 +84,8 @@ def test_the_intervals_hold_the_planted_differences():
     change = np.array([1, 1.05, 1, 1, np.exp(-1j * np.radians(3)), 1])
     held, named = 0, 0
     for k in range(20):
-        one = decided(motion(WAVE, 100 + k), motion(WAVE * change, 200 + k))
-        known = {(d.quantity, d.place): d.difference.ci95 for d in one.differences}
+        decision = decided(motion(WAVE, 100 + k), motion(WAVE * change, 200 + k))
+        by_key = {(d.quantity, d.place): d.difference.ci95 for d in decision.differences}
         truth = {
             ("amplitude", "joint02"): 0.05,
             ("phase_lag", "joint05"): np.radians(3),
@@ -94,25 +94,27 @@ def test_the_intervals_hold_the_planted_differences():
             ("phase_lag", "joint02"): 0.0,
             ("frequency", "body"): 0.0,
         }
-        held += all(known[key][0] <= value <= known[key][1] for key, value in truth.items())
-        named += {n.name for n in one.named} == {"joint02", "joint05"}
+        held += all(by_key[key][0] <= value <= by_key[key][1] for key, value in truth.items())
+        named += {n.name for n in decision.named} == {"joint02", "joint05"}
     assert held >= 18
     assert named >= 18
 
 
 def test_a_joint_late_by_itself_is_named_and_not_the_next_one():
-    one = decided(motion(WAVE, 1), motion(WAVE * np.exp(-1j * np.radians(3) * np.eye(6)[2]), 2))
-    assert [n.name for n in one.named] == ["joint03"]
+    decision = decided(
+        motion(WAVE, 1), motion(WAVE * np.exp(-1j * np.radians(3) * np.eye(6)[2]), 2)
+    )
+    assert [n.name for n in decision.named] == ["joint03"]
 
 
 def test_a_joint_that_rests_on_one_side_differs_and_shifts_no_other_lag():
     resting = WAVE * np.array([1, 1, 1, 0, 1, 1])
-    one = decided(motion(WAVE, 3), motion(resting, 4))
-    assert [n.name for n in one.named] == ["joint04"]
-    known = {(d.quantity, d.place): d for d in one.differences}
-    low, high = known["rest_amplitude", "joint04"].difference.ci95
+    decision = decided(motion(WAVE, 3), motion(resting, 4))
+    assert [n.name for n in decision.named] == ["joint04"]
+    by_key = {(d.quantity, d.place): d for d in decision.differences}
+    low, high = by_key["rest_amplitude", "joint04"].difference.ci95
     assert low < -0.4 < high < -0.39
-    low, high = known["phase_lag", "joint05"].difference.ci95
+    low, high = by_key["phase_lag", "joint05"].difference.ci95
     assert low < 0 < high
 
 
@@ -122,12 +124,14 @@ def test_each_plane_has_its_wave():
     a, b = (
         0.3 * np.exp(-1j * np.where(np.arange(25) % 2, step, 0.4) * place) for step in (0.5, 0.55)
     )
-    one = decided(motion(a, 1, robot=robot), motion(b, 2, robot=robot))
+    decision = decided(motion(a, 1, robot=robot), motion(b, 2, robot=robot))
     first, second = dict.fromkeys(joint.plane for joint in robot.joints)
-    known = {(d.quantity, d.place): d for d in one.differences}
-    assert known["wave_number", f"body, {second}"].difference.value == pytest.approx(0.05, abs=2e-3)
-    assert known["wave_number", f"body, {first}"].p_holm > 0.05
-    late = {d.place for d in one.differences if d.quantity == "phase_lag" and d.p_holm < 0.05}
+    by_key = {(d.quantity, d.place): d for d in decision.differences}
+    assert by_key["wave_number", f"body, {second}"].difference.value == pytest.approx(
+        0.05, abs=2e-3
+    )
+    assert by_key["wave_number", f"body, {first}"].p_holm > 0.05
+    late = {d.place for d in decision.differences if d.quantity == "phase_lag" and d.p_holm < 0.05}
     assert late == set(robot.joint_names[3::2])
 
 
@@ -137,16 +141,16 @@ def write(bag, epoch_ns):
 
     def make(name, seed, amplitudes=WAVE, *, omega=OMEGA, noise=NOISE, commands=False):
         rng = np.random.default_rng(seed)
-        one, start_s = bag(f"{name}.mcap"), rng.uniform(0, 1)
+        log, start_s = bag(f"{name}.mcap"), rng.uniform(0, 1)
         for k in range(500):
             t_ns = epoch_ns + k * 20_000_000
             true = np.real(amplitudes * np.exp(1j * omega * (start_s + 0.02 * k))) + 0.1
             q = true + noise * rng.standard_normal(len(true))
             if commands:
-                one.write("/joint_commands", t_ns, NAMES, true)
-            one.write("/joint_states", t_ns, NAMES, q)
-        one.close()
-        return one.path
+                log.write("/joint_commands", t_ns, NAMES, true)
+            log.write("/joint_states", t_ns, NAMES, q)
+        log.close()
+        return log.path
 
     return make
 
@@ -162,10 +166,10 @@ def test_a_planted_difference_is_the_answer(write):
     assert result.verdict == "different"
     assert result.answer.startswith("B differs from A: joint03 most, amplitude +")
     assert "phase lag +" in result.answer
-    assert [one.name for one in result.named] == ["joint03"]
+    assert [joint.name for joint in result.named] == ["joint03"]
     assert not result.commanded
     assert result.partial is None
-    worst = max(result.waveforms, key=lambda one: one.rms_rad)
+    worst = max(result.waveforms, key=lambda waveform: waveform.rms_rad)
     assert worst.name == "joint03"
     phase = np.array(result.phase_rad)  # 0 at the crest of joint01
     lag = 1.4 + np.radians([0.0, 3.0])

@@ -25,7 +25,7 @@ def write(bag, wave, epoch_ns):
         if change is not None:
             change(truth)
         rng = np.random.default_rng(seed)
-        one = bag(f"{name}.mcap")
+        log = bag(f"{name}.mcap")
         for t_ns in truth.ticks_ns:
             own_ns = t_ns + round(late_s * 1e9)
             t = (own_ns - epoch_ns) * 1e-9
@@ -33,9 +33,9 @@ def write(bag, wave, epoch_ns):
             size = truth.omega * truth.gain * truth.amplitude
             rate = size * np.cos(truth.omega * t + truth.phase - truth.lag)
             torque = energy * rate / size + rng.normal(0, 0.05, joints)
-            one.write_both(t_ns, truth.names, truth.command(own_ns), q, rate, torque)
-        one.close()
-        return one.path
+            log.write_both(t_ns, truth.names, truth.command(own_ns), q, rate, torque)
+        log.close()
+        return log.path
 
     return make
 
@@ -62,13 +62,15 @@ def test_the_weakened_joint_is_named_with_its_true_difference(write):
     result = compared(write("a", 1), write("b", 2, late_s=0.34, change=weaken))
     assert result.verdict == "different"
     assert result.answer.startswith("B differs from A: joint03 most, gain −5.")
-    assert [one.name for one in result.named] == ["joint03"]
-    known = by_key(result)
-    low, high = known["gain", "joint03"].difference.ci95
+    assert [joint.name for joint in result.named] == ["joint03"]
+    differences = by_key(result)
+    low, high = differences["gain", "joint03"].difference.ci95
     assert low < -0.05 < high
-    low, high = known["lag", "joint03"].difference.ci95
+    low, high = differences["lag", "joint03"].difference.ci95
     assert low < np.radians(3.0) < high
-    assert all(one.p_holm > 0.05 for key, one in known.items() if key[1] != "joint03")
+    assert all(
+        difference.p_holm > 0.05 for key, difference in differences.items() if key[1] != "joint03"
+    )
     assert result.partial is None
     assert any("one session a side" in warning for warning in result.warnings)
 
@@ -86,7 +88,7 @@ def test_mean_cycles_differ_as_in_closed_form(write, wave):
         off = np.abs(np.array(waveform.difference_rad) - (b - a))
         assert np.mean(off <= np.array(waveform.half_rad)) > 0.9
         np.testing.assert_allclose(waveform.a_rad, a + 0.04, atol=5 * SIGMA / np.sqrt(7))
-    assert max(result.waveforms, key=lambda one: one.rms_rad).name == "joint03"
+    assert max(result.waveforms, key=lambda waveform: waveform.rms_rad).name == "joint03"
 
 
 @pytest.mark.slow
@@ -172,7 +174,7 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, com
     heading = re.sub("<[^>]+>", "", re.search(r"<h1.*?</h1>", html, re.DOTALL)[0])
     assert unescape(heading).replace("\N{NO-BREAK SPACE}", " ") == f"{result.answer}."
     named = re.search(r'<table class="named">.*?</table>', html, re.DOTALL)[0]
-    assert re.findall(r"</span>(joint\d+)</th>", named) == [one.name for one in result.named]
+    assert re.findall(r"</span>(joint\d+)</th>", named) == [joint.name for joint in result.named]
     assert result.named[0].name == "joint03"
     every = re.search(r'<table class="quantities">.*?</table>', html, re.DOTALL)[0]
     assert every.count("<tr") == 1 + len(result.differences)

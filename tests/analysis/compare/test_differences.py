@@ -23,8 +23,8 @@ def keys_of(count):
     return [(quantity, f"joint{i}") for quantity in ("gain", "lag") for i in range(count)]
 
 
-def simultaneous(found, truth):
-    return bool(np.all(np.abs(found.value - truth) <= found.half))
+def simultaneous(difference, truth):
+    return bool(np.all(np.abs(difference.value - truth) <= difference.half))
 
 
 def within(share, expected, trials=SEEDS):
@@ -35,8 +35,8 @@ def within(share, expected, trials=SEEDS):
 def test_welch_and_paired_agree_with_scipy():
     rng = np.random.default_rng(0)
     a, b = rng.normal(0, 1, (5, 4)), rng.normal(0.5, 2, (7, 4))
-    found = independent(from_runs(a), from_runs(b))
-    np.testing.assert_allclose(found.p, stats.ttest_ind(b, a, equal_var=False).pvalue)
+    difference = independent(from_runs(a), from_runs(b))
+    np.testing.assert_allclose(difference.p, stats.ttest_ind(b, a, equal_var=False).pvalue)
     np.testing.assert_allclose(paired(a, b[:5]).p, stats.ttest_rel(b[:5], a).pvalue)
 
 
@@ -52,15 +52,15 @@ def test_two_sessions_intervals_hold_together_and_false_names_are_rare():
     step = rng.normal(0, 0.05, truth.size)
     sigma_a = rng.uniform(1e-3, 4e-3, truth.size)
     sigma_b = rng.uniform(1e-3, 4e-3, truth.size)
-    together, each, false = [], [], []
+    together, alone, false = [], [], []
     for _ in range(SEEDS):
         a = single(rng, truth, sigma_a, 16)
-        found = independent(a, single(rng, truth + step, sigma_b, 24))
-        together.append(simultaneous(found, step))
-        own = stats.t.ppf(0.975, found.dof) * found.error
-        each.append(np.mean(np.abs(found.value - step) <= own))
+        difference = independent(a, single(rng, truth + step, sigma_b, 24))
+        together.append(simultaneous(difference, step))
+        half = stats.t.ppf(0.975, difference.dof) * difference.error
+        alone.append(np.mean(np.abs(difference.value - step) <= half))
         false.append(bool(np.any(holm(independent(a, single(rng, truth, sigma_b, 24)).p) < 0.05)))
-    assert within(np.mean(each), 0.95, SEEDS * truth.size / 4)
+    assert within(np.mean(alone), 0.95, SEEDS * truth.size / 4)
     assert np.mean(together) > 0.95 - 3 * np.sqrt(0.05 * 0.95 / SEEDS)
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / SEEDS)
     assert np.mean(false) > 0.02  # it is a test of the level, not one that never finds anything
@@ -79,11 +79,11 @@ def test_groups_hold_the_level_whatever_runs_share(runs, is_paired):
         if is_paired:
             shared = 10 * rng.normal(size=(runs[0], k))
             a, b = a + shared, b + shared
-        found, null = (
+        difference, null = (
             paired(a, other) if is_paired else independent(from_runs(a), from_runs(other))
             for other in (b + 0.7, b)
         )
-        covered.append(simultaneous(found, 0.7))
+        covered.append(simultaneous(difference, 0.7))
         false.append(bool(np.any(holm(null.p) < 0.05)))
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / SEEDS)
     assert np.mean(covered) > 0.95 - 3 * np.sqrt(0.05 * 0.95 / SEEDS)
@@ -113,7 +113,7 @@ def test_what_differs_is_ranked_by_size_in_margins_and_named():
     decided = decide(names, a, b, independent(a, b), Margins())
     largest = [(difference.quantity, difference.place) for difference in decided.differences[:3]]
     assert largest == [("lag", "joint2"), ("gain", "joint2"), ("gain", "joint3")]
-    assert [one.name for one in decided.named] == ["joint2", "joint3"]
+    assert [joint.name for joint in decided.named] == ["joint2", "joint3"]
     gain = decided.differences[1]
     assert (gain.difference.value, gain.a) == (pytest.approx(np.exp(-0.06) - 1), 1.0)
     assert (gain.b, gain.size) == (pytest.approx(np.exp(-0.06)), pytest.approx(3.0))

@@ -63,10 +63,12 @@ def test_the_centre_of_mass_of_a_straight_robot_is_half_a_body_behind_its_head()
     quaternion = quaternion_from_rotation(turn)
     quaternion[4:] *= -1
     t_s = np.arange(11.0)
-    found = centre_of_mass(robot, t_s[::2], (t_s, np.zeros((11, 3)), quaternion), np.zeros((6, 25)))
+    centre = centre_of_mass(
+        robot, t_s[::2], (t_s, np.zeros((11, 3)), quaternion), np.zeros((6, 25))
+    )
     behind = robot.links[0].length * 25 / 2
     expected = -behind * np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1)[::2]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(centre, expected, atol=1e-12)
 
 
 def test_cycles_by_phase_keep_every_harmonic():

@@ -33,7 +33,7 @@ def work(rng, middle=0.0):
 
     def command(t_s):
         waves = zip(TONES, phases, strict=True)
-        return middle + sum(0.12 * np.sin(2 * np.pi * tone * t_s + own) for tone, own in waves)
+        return middle + sum(0.12 * np.sin(2 * np.pi * tone * t_s + phase) for tone, phase in waves)
 
     return command
 
@@ -82,7 +82,7 @@ def test_an_offset_that_moved_and_a_gain_that_fell_are_stated_with_their_interva
     assert low < 5.1 * DEGREE < high < low + 0.5 * DEGREE
     low, high = differences["gain", "j2"].ci95
     assert low < -0.2 < high
-    assert [one.name for one in result.named] == ["j2"]
+    assert [joint.name for joint in result.named] == ["j2"]
     assert any("not how one run differs from the next" in text for text in result.warnings)
 
 
@@ -90,7 +90,7 @@ def test_joints_that_did_not_change_do_not_differ_with_other_commands(tmp_path):
     """Whether a servo holds a command until the next is open, and 20 ms of the lag with it."""
     result = compared(write(tmp_path / "a.mcap", 3), write(tmp_path / "b.mcap", 4))
     assert result.verdict in ("same", "open"), result.answer
-    shown = {one.quantity for one in result.equivalence if one.p < 0.05}
+    shown = {row.quantity for row in result.equivalence if row.p < 0.05}
     assert {"gain", "offset"} <= shown
 
 

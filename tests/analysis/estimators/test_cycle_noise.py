@@ -58,22 +58,26 @@ def test_ratios_and_noise_of_runs_of_any_length_are_those_of_a_loop():
             answer = asked[-1] * (0.9 + 0.01 * rng.normal(size=size))
             given.append(np.where(rng.random(size) < 0.05, 0.0, answer))
         settled = [-np.inf, 1.0, 2.0, 101.0, 202.0, 303.0][number % 6]
-        found = cycles_of(edges, asked, given, settled_s=settled)
+        responses = cycles_of(edges, asked, given, settled_s=settled)
         ratio, variance, dof = by_loops(edges, asked, given, settled)
-        np.testing.assert_allclose(found.ratio, ratio, rtol=1e-9)
-        np.testing.assert_allclose(found.variance, variance, rtol=1e-9)
-        assert found.dof == pytest.approx(dof)
-        np.testing.assert_array_equal(found.start_s, np.concatenate([edge[:-1] for edge in edges]))
-        np.testing.assert_array_equal(found.stop_s, np.concatenate([edge[1:] for edge in edges]))
+        np.testing.assert_allclose(responses.ratio, ratio, rtol=1e-9)
+        np.testing.assert_allclose(responses.variance, variance, rtol=1e-9)
+        assert responses.dof == pytest.approx(dof)
+        np.testing.assert_array_equal(
+            responses.start_s, np.concatenate([edge[:-1] for edge in edges])
+        )
+        np.testing.assert_array_equal(
+            responses.stop_s, np.concatenate([edge[1:] for edge in edges])
+        )
         seen.add(dof > 0)
     assert seen == {True, False}
 
 
 def test_runs_whose_command_is_unknown_have_no_response():
     nothing = np.full(3, np.nan + 0j)
-    found = cycles_of([np.arange(4.0)], [nothing], [np.ones(3) + 0j])
-    assert isinstance(found, CycleResponses)
-    assert np.isnan(found.ratio).all()
+    responses = cycles_of([np.arange(4.0)], [nothing], [np.ones(3) + 0j])
+    assert isinstance(responses, CycleResponses)
+    assert np.isnan(responses.ratio).all()
     still = cycles_of([np.arange(4.0)], [np.zeros(3) + 0j], [np.ones(3) + 0j])
     assert np.isnan(still.ratio).all()
     assert still.dof == 0.0
@@ -146,13 +150,13 @@ def test_a_second_harmonic_is_fitted_beside_the_first():
     plain = Series("q", t, 0.4 * np.cos(angle + 1.0))
     edges = phase.edges_s()
     both = Series("q", t, plain.values + 0.3 * np.sin(2 * angle))
-    one, share = _amplitudes(plain, phase, edges)
+    amplitude, share = _amplitudes(plain, phase, edges)
     other, less = _amplitudes(both, phase, edges)
-    known = np.isfinite(one) & np.isfinite(other)
-    assert known.sum() >= 6
-    np.testing.assert_allclose(one[known], 0.4 * np.exp(1j), atol=0.08)
-    np.testing.assert_allclose(other[known], one[known], atol=0.08)
-    assert (share[known] > less[known] + 0.1).all()
+    finite = np.isfinite(amplitude) & np.isfinite(other)
+    assert finite.sum() >= 6
+    np.testing.assert_allclose(amplitude[finite], 0.4 * np.exp(1j), atol=0.08)
+    np.testing.assert_allclose(other[finite], amplitude[finite], atol=0.08)
+    assert (share[finite] > less[finite] + 0.1).all()
 
 
 def test_holes_are_those_of_a_loop():
@@ -174,11 +178,11 @@ def test_weights_of_cycles_are_those_of_a_loop():
     for cycles in (1, 2, 5):
         t = np.sort(rng.uniform(2.0, 7.0, 40))
         t = t[(t < 4.1) | (t > 5.9)]
-        found = weigh(t, 2.0, 7.0, cycles)
+        result = weigh(t, 2.0, 7.0, cycles)
         weights, period = sample_weights(t, 2.0, 7.0), 5.0 / cycles
         place = np.minimum(np.floor((t - 2.0) / period), cycles - 1)
         sums = np.array([weights[place == k].sum() for k in range(cycles)])
-        np.testing.assert_allclose(found.weights, weights)
-        np.testing.assert_allclose(found.covered, np.minimum(sums / period, 1.0))
-        assert found.starts.tolist() == [0, *(np.sum(place <= k) for k in range(cycles))]
-        assert found.coverage == pytest.approx(min(1.0, weights.sum() / 5.0))
+        np.testing.assert_allclose(result.weights, weights)
+        np.testing.assert_allclose(result.covered, np.minimum(sums / period, 1.0))
+        assert result.starts.tolist() == [0, *(np.sum(place <= k) for k in range(cycles))]
+        assert result.coverage == pytest.approx(min(1.0, weights.sum() / 5.0))

@@ -12,10 +12,10 @@ def test_sums_of_each_cycle_empty_ones_too():
     t_s = t_s[(t_s < 3.2) | (t_s > 5.1)]
     edges = np.array([-2.0, -1.0, 0.7, 3.3, 4.0, 5.0, 7.7, 10.5, 11.0])
     values = rng.standard_normal((2, 3, t_s.size))
-    found = cycle_sums(values, starts_of(t_s, edges))
+    sums = cycle_sums(values, starts_of(t_s, edges))
     for k in range(edges.size - 1):
         inside = (t_s >= edges[k]) & (t_s < edges[k + 1])
-        np.testing.assert_allclose(found[..., k], values[..., inside].sum(axis=-1), atol=1e-12)
+        np.testing.assert_allclose(sums[..., k], values[..., inside].sum(axis=-1), atol=1e-12)
     assert not cycle_sums(values, starts_of(t_s, np.array([-3.0, -2.0, -1.0]))).any()
 
 

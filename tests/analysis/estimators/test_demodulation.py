@@ -41,8 +41,8 @@ def cycles(phi, command, response, **options):
     return cycles_of([edges], [pair[0]], [pair[1]], **options)
 
 
-def middle(found):
-    return (found.start_s + found.stop_s) / 2
+def middle(responses):
+    return (responses.start_s + responses.stop_s) / 2
 
 
 OMEGA = np.pi * (1 + 0.3 * np.sin(2 * np.pi * T / 23))
@@ -55,32 +55,32 @@ OFFSET = 0.15 * np.sin(2 * np.pi * T / 17)
 def test_a_steady_wave_is_estimated_to_rounding():
     same = np.ones(T.size)
     phi, command, response = wave(np.pi * same, 0.9 * same, 0.3 * same, 0.4 * same)
-    found = cycles(phi, command, Series("q", T, response))
-    assert found.ratio.size == 28  # of thirty cycles less a sample, half a one at either end
-    np.testing.assert_allclose(found.ratio, 0.9 * np.exp(-0.3j), atol=1e-9)
+    responses = cycles(phi, command, Series("q", T, response))
+    assert responses.ratio.size == 28  # of thirty cycles less a sample, half a one at either end
+    np.testing.assert_allclose(responses.ratio, 0.9 * np.exp(-0.3j), atol=1e-9)
 
 
 def test_slow_changes_of_everything_are_followed():
     """Frequency +-30 %, gain +-9 %, lag +-0.15 rad, amplitude and offset of the steering."""
     phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE, OFFSET)
-    found = cycles(phi, command, Series("q", T, response))
-    at = middle(found)
+    responses = cycles(phi, command, Series("q", T, response))
+    at = middle(responses)
     gain, lag = np.interp(at, T, GAIN), np.interp(at, T, LAG)
     # A cycle's gain is its mean; in one cycle the truth changes by up to 0.03 and 2.6 degrees.
-    np.testing.assert_allclose(np.abs(found.ratio), gain, atol=0.007)
-    np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
-    turns = np.interp(found.stop_s, T, phi) - np.interp(found.start_s, T, phi)
+    np.testing.assert_allclose(np.abs(responses.ratio), gain, atol=0.007)
+    np.testing.assert_allclose(-np.angle(responses.ratio), lag, atol=np.radians(0.4))
+    turns = np.interp(responses.stop_s, T, phi) - np.interp(responses.start_s, T, phi)
     np.testing.assert_allclose(turns, 2 * np.pi, atol=1e-6)
 
 
 def test_responses_on_their_own_times():
     phi, command, _ = wave(OMEGA, GAIN, LAG, AMPLITUDE)
-    own = T + 0.004
-    lagging = np.interp(own, T, phi) - 0.4 - np.interp(own, T, LAG)
-    values = np.interp(own, T, GAIN * AMPLITUDE) * np.sin(lagging)
-    found = cycles(phi, command, Series("q", own, values))
-    lag = np.interp(middle(found), T, LAG)
-    np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
+    later_s = T + 0.004
+    lagging = np.interp(later_s, T, phi) - 0.4 - np.interp(later_s, T, LAG)
+    values = np.interp(later_s, T, GAIN * AMPLITUDE) * np.sin(lagging)
+    responses = cycles(phi, command, Series("q", later_s, values))
+    lag = np.interp(middle(responses), T, LAG)
+    np.testing.assert_allclose(-np.angle(responses.ratio), lag, atol=np.radians(0.4))
 
 
 @pytest.mark.nightly
@@ -94,9 +94,9 @@ def test_intervals_cover_in_white_and_coloured_noise(memory):
     inside = []
     for _ in range(60):
         noise = lfilter([1], [1, -memory], rng.normal(0, 0.01 * (1 - memory**2) ** 0.5, T.size))
-        found = cycles(phi, command, Series("q", T, response + noise))
-        half = t_factor(found.dof) * found.variance**0.5
-        error = np.log(found.ratio / exact)
+        responses = cycles(phi, command, Series("q", T, response + noise))
+        half = t_factor(responses.dof) * responses.variance**0.5
+        error = np.log(responses.ratio / exact)
         inside += [np.abs(error.real) < half, np.abs(error.imag) < half]
     assert 0.93 <= np.mean(inside) <= 0.97
 
@@ -104,15 +104,15 @@ def test_intervals_cover_in_white_and_coloured_noise(memory):
 def test_what_a_cycle_cannot_tell_is_missing():
     phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
     kept = (T < 20) | (T > 23)
-    found = cycles(phi, command, Series("q", T[kept], response[kept]))
-    holed = (found.stop_s > 20) & (found.start_s < 23)
+    responses = cycles(phi, command, Series("q", T[kept], response[kept]))
+    holed = (responses.stop_s > 20) & (responses.start_s < 23)
     # Also the neighbours, whose mean over a cycle around each sample reaches in.
-    assert np.isnan(found.ratio[holed]).all()
-    assert np.isfinite(found.ratio[(found.stop_s < 18) | (found.start_s > 25)]).all()
+    assert np.isnan(responses.ratio[holed]).all()
+    assert np.isfinite(responses.ratio[(responses.stop_s < 18) | (responses.start_s > 25)]).all()
     still = Series("q", T, np.where(T < 30, 0.0, command.values))
-    found = cycles(phi, still, Series("q", T, response))
-    assert np.isnan(found.ratio[found.stop_s < 28]).all()
-    assert np.isfinite(found.ratio[found.start_s > 32]).all()
+    responses = cycles(phi, still, Series("q", T, response))
+    assert np.isnan(responses.ratio[responses.stop_s < 28]).all()
+    assert np.isfinite(responses.ratio[responses.start_s > 32]).all()
 
 
 def test_a_phase_that_does_not_drive_the_command_gives_nothing():
@@ -126,10 +126,10 @@ def test_too_few_cycles_have_no_interval():
     phase = LoggedPhase(T[:800], phi[:800])
     edges = phase.edges_s()
     pair = demodulate(command, Series("q", T, response), phase, edges)
-    found = cycles_of([edges], [pair[0]], [pair[1]])
-    assert np.isfinite(found.ratio).all()
-    assert np.isnan(found.variance).all()
-    assert found.dof == 0
+    responses = cycles_of([edges], [pair[0]], [pair[1]])
+    assert np.isfinite(responses.ratio).all()
+    assert np.isnan(responses.variance).all()
+    assert responses.dof == 0
 
 
 def over_time(path, phi):
@@ -177,17 +177,17 @@ def test_the_noise_of_a_cycle_is_that_of_its_second_differences():
     rng = np.random.default_rng(8)
     edges = [np.arange(42.0), np.arange(100.0, 131.0)]
     asked = [0.5 + 0.1 * np.cos(np.arange(edge.size - 1)) + 0j for edge in edges]
-    truth = [0.8 * np.exp(-0.3j + 0.01j * np.arange(one.size)) for one in asked]
+    truth = [0.8 * np.exp(-0.3j + 0.01j * np.arange(command.size)) for command in asked]
     sigma = 0.002
     given = [
         h * c + sigma * (rng.normal(size=c.size) + 1j * rng.normal(size=c.size))
         for h, c in zip(truth, asked, strict=True)
     ]
-    found = cycles_of(edges, asked, given)
-    np.testing.assert_allclose(found.ratio, np.concatenate(given) / np.concatenate(asked))
+    responses = cycles_of(edges, asked, given)
+    np.testing.assert_allclose(responses.ratio, np.concatenate(given) / np.concatenate(asked))
     expected = sigma**2 / np.abs(np.concatenate(given)) ** 2
-    np.testing.assert_allclose(found.variance, expected, rtol=0.5)
-    assert found.variance[3] / found.variance[5] == pytest.approx(expected[3] / expected[5])
+    np.testing.assert_allclose(responses.variance, expected, rtol=0.5)
+    assert responses.variance[3] / responses.variance[5] == pytest.approx(expected[3] / expected[5])
     by_hand = []
     for h, c in zip(given, asked, strict=True):
         ratio, share = h / c, 1 / np.abs(c) ** 2
@@ -195,15 +195,17 @@ def test_the_noise_of_a_cycle_is_that_of_its_second_differences():
             second = abs(ratio[k - 1] - 2 * ratio[k] + ratio[k + 1]) ** 2
             by_hand.append(second / (share[k - 1] + 4 * share[k] + share[k + 1]))
     power = np.abs(np.concatenate(given)) ** 2
-    np.testing.assert_allclose(found.variance, np.mean(by_hand) / 2 / power)
-    assert found.dof == pytest.approx(_difference_dof(len(by_hand)))
-    np.testing.assert_array_equal(found.start_s, np.r_[np.arange(41.0), np.arange(100.0, 130.0)])
-    np.testing.assert_array_equal(found.stop_s, found.start_s + 1.0)
+    np.testing.assert_allclose(responses.variance, np.mean(by_hand) / 2 / power)
+    assert responses.dof == pytest.approx(_difference_dof(len(by_hand)))
+    np.testing.assert_array_equal(
+        responses.start_s, np.r_[np.arange(41.0), np.arange(100.0, 130.0)]
+    )
+    np.testing.assert_array_equal(responses.stop_s, responses.start_s + 1.0)
     late = cycles_of(edges, asked, given, settled_s=50.0)
     np.testing.assert_allclose(late.variance, np.mean(by_hand[39:]) / 2 / power)
     # Too few are left: all count.
     np.testing.assert_allclose(
-        cycles_of(edges, asked, given, settled_s=128.0).variance, found.variance
+        cycles_of(edges, asked, given, settled_s=128.0).variance, responses.variance
     )
 
 
@@ -225,15 +227,15 @@ def test_the_amplitude_of_a_cycle_is_that_of_its_own_samples():
     t, omega = np.sort(rng.uniform(0.0, 4.0, 60)), 2 * np.pi
     starts = np.searchsorted(t, [0.0, 1.0, 1.2, 2.0, 4.0])
     values = rng.normal(size=(2, 3, t.size))
-    found = amplitudes(t, values, starts, omega)
-    assert found.shape == (2, 3, 4)
+    measured = amplitudes(t, values, starts, omega)
+    assert measured.shape == (2, 3, 4)
     for k, (i, j) in enumerate(itertools.pairwise(starts.tolist())):
         if j - i < 6:
-            assert np.isnan(found[..., k]).all()
+            assert np.isnan(measured[..., k]).all()
             continue
         rows = np.stack([np.ones(j - i), np.cos(omega * t[i:j]), -np.sin(omega * t[i:j])], axis=1)
         best = np.linalg.lstsq(rows, values[..., i:j].reshape(6, -1).T, rcond=None)[0]
-        np.testing.assert_allclose(found[..., k].ravel(), best[1] + 1j * best[2], atol=1e-9)
+        np.testing.assert_allclose(measured[..., k].ravel(), best[1] + 1j * best[2], atol=1e-9)
     few = amplitudes(t, values, np.array([0, 3, 5]), omega)
     assert few.shape == (2, 3, 2)
     assert np.isnan(few).all()

@@ -33,13 +33,13 @@ def test_a_step_goes_a_quarter_of_a_bin_at_most(monkeypatch, sign):
     span = 20.0
     for bins, clipped in ((0.4, True), (0.2, False)):
         start = OMEGA - sign * bins * 2 * np.pi / span
-        found = fit_shared(series, start, MODEL).omega - start
-        wanted = _gauss_newton_step(
-            [([k], solve([one], start, MODEL)) for k, one in enumerate(series)]
+        step = fit_shared(series, start, MODEL).omega - start
+        expected = _gauss_newton_step(
+            [([k], solve([channel], start, MODEL)) for k, channel in enumerate(series)]
         )
-        assert sign * wanted > 0
-        assert (abs(wanted) > np.pi / 2 / span) == clipped
-        assert found == pytest.approx(sign * np.pi / 2 / span if clipped else wanted, rel=1e-9)
+        assert sign * expected > 0
+        assert (abs(expected) > np.pi / 2 / span) == clipped
+        assert step == pytest.approx(sign * np.pi / 2 / span if clipped else expected, rel=1e-9)
 
 
 def test_after_the_last_step_the_fit_is_that_of_its_frequency(monkeypatch):
@@ -91,9 +91,9 @@ def test_channels_of_different_lengths_share_their_frequency_by_what_they_tell()
     fit = fit_shared(series, OMEGA + 0.02, MODEL)
     noise, bins = residual_spectrum(series, fit)
     variance, dof = omega_variance(fit, noise)
-    each = [n * T**2 / (24 * sigma**2) for n, T in zip(counts, spans, strict=True)]
-    assert variance == pytest.approx(1 / sum(each), rel=0.5)
-    assert abs(fit.omega - OMEGA) < 4 / sum(each) ** 0.5
+    information = [n * T**2 / (24 * sigma**2) for n, T in zip(counts, spans, strict=True)]
+    assert variance == pytest.approx(1 / sum(information), rel=0.5)
+    assert abs(fit.omega - OMEGA) < 4 / sum(information) ** 0.5
     assert 12 <= dof <= 48
     np.testing.assert_allclose(noise.level, sigma**2, rtol=0.8)
     # What they share lies in the bins of the shorter one.

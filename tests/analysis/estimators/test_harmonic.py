@@ -50,13 +50,13 @@ class Trials:
             phase = rng.uniform(-3, 3) - np.arange(m) * np.pi / 3
             commands, responses = [], []
             for i in range(m):
-                own = polled[i // 5]
+                times = polled[i // 5]
                 command = amplitude * np.sin(omega * t + phase[i])
                 command += noisy_command * sigma * coloured(rng, n, correlation)
-                response = gain * amplitude * np.sin(omega * own + phase[i] - lag[i])
+                response = gain * amplitude * np.sin(omega * times + phase[i] - lag[i])
                 response += sigma * coloured(rng, n, correlation)
                 commands.append(Series(f"c{i}", t, command))
-                responses.append(Series(f"r{i}", own, response))
+                responses.append(Series(f"r{i}", times, response))
             channels = commands + responses
             fit = fit_shared(channels, omega + 2 * np.pi / duration * rng.uniform(-0.2, 0.2))
             noise = residual_noise(channels, fit)
@@ -138,8 +138,8 @@ def test_one_channel_against_scipy_curve_fit():
 
     def model(t, omega, b, *parts):
         c1, s1, c2, s2 = parts
-        one, two = omega * t, 2 * omega * t
-        return b + c1 * np.cos(one) - s1 * np.sin(one) + c2 * np.cos(two) - s2 * np.sin(two)
+        phase, two = omega * t, 2 * omega * t
+        return b + c1 * np.cos(phase) - s1 * np.sin(phase) + c2 * np.cos(two) - s2 * np.sin(two)
 
     theirs, covariance = curve_fit(model, t, y, p0=[5.0, 0, 0.4, 0, 0, 0], xtol=1e-14, ftol=1e-14)
     series = [Series("q", t, y)]

@@ -75,8 +75,8 @@ def test_independent_noise_is_students():
     drawn = np.concatenate([noise_draws(NoisyMatrix(error, error, dof), k) for k in range(10)])
     assert drawn.shape == (4000, 1, 2)
     for k, name in enumerate(("few", "many")):
-        found = stats.kstest(drawn[:, 0, k] / error[0, k], stats.t(dof[0, k]).cdf)
-        assert found.pvalue > 0.001, name
+        test = stats.kstest(drawn[:, 0, k] / error[0, k], stats.t(dof[0, k]).cdf)
+        assert test.pvalue > 0.001, name
 
 
 def test_correlated_noise_has_its_correlation_and_one_level_a_draw():
@@ -84,8 +84,8 @@ def test_correlated_noise_has_its_correlation_and_one_level_a_draw():
     error, dof = np.full((2, 3), 2.0), np.full((2, 3), 4.0)
     matrix = NoisyMatrix(error, error, dof, correlation)
     drawn = np.concatenate([noise_draws(matrix, k) for k in range(20)])
-    found = stats.kstest(drawn[:, 0, 1] / 2.0, stats.t(4.0).cdf)
-    assert found.pvalue > 0.001
+    test = stats.kstest(drawn[:, 0, 1] / 2.0, stats.t(4.0).cdf)
+    assert test.pvalue > 0.001
     both = stats.spearmanr(drawn[:, 0, 0], drawn[:, 1, 0]).statistic
     assert both == pytest.approx(0.78, abs=0.03)
     columns = stats.spearmanr(drawn[:, 0, 0], drawn[:, 0, 1]).statistic
@@ -98,20 +98,20 @@ def test_a_ratio_of_norms_takes_the_noise_off_and_covers():
     above, below = np.array([[0.6, 0.0], [0.0, 0.8]]), np.array([[2.0, 0.0], [0.0, 0.0]])
     held = values = 0
     for _ in range(300):
-        noisy = [one + RNG.normal(0.0, 0.1, (2, 2)) for one in (above, below)]
+        noisy = [matrix + RNG.normal(0.0, 0.1, (2, 2)) for matrix in (above, below)]
         noises = [RNG.normal(0.0, 0.1, (400, 2, 2)) for _ in range(2)]
-        found = norm_ratio(noisy[0], noises[0], noisy[1], noises[1])
-        held += found.ci95[0] <= 0.5 <= found.ci95[1]
-        values += found.value
+        ratio = norm_ratio(noisy[0], noises[0], noisy[1], noises[1])
+        held += ratio.ci95[0] <= 0.5 <= ratio.ci95[1]
+        values += ratio.value
     assert held >= 285
     assert values / 300 == pytest.approx(0.5, abs=0.01)  # 0.51 with the noise in it
 
 
 def test_a_ratio_by_hand():
     noise = np.full((100, 1), 3.0)
-    found = norm_ratio(np.array([5.0]), noise, np.array([10.0]), 2 * noise)
-    assert found.value == pytest.approx(4.0 / 8.0)
-    assert found.ci95 == pytest.approx((2.0 / 16.0, 8.0 / 4.0))
+    ratio = norm_ratio(np.array([5.0]), noise, np.array([10.0]), 2 * noise)
+    assert ratio.value == pytest.approx(4.0 / 8.0)
+    assert ratio.ci95 == pytest.approx((2.0 / 16.0, 8.0 / 4.0))
     low = norm_ratio(np.array([2.0]), noise, np.array([10.0]), 2 * noise)
     assert (low.value, low.ci95[0]) == (0.0, 0.0)
     lost = norm_ratio(np.array([5.0]), noise, np.array([5.0]), 2 * noise)
@@ -134,23 +134,23 @@ def test_errors_of_a_logarithm_are_relative_errors():
         ResidualBins(**_bins(values, spread, rounding + np.diag(added)))
         for values, added in zip(bins, ([0.0, 0.0], [0.04, 0.01]), strict=True)
     ]
-    found = response_errors(
+    errors = response_errors(
         command, parts[0], response, parts[1], omega_variance=0.25, delay_between_s=np.arange(3.0)
     )
     scale = np.sqrt(spread)[:2, None]
     expected = scale * (bins[1][:2] / response[:2, None] - bins[0][:2] / command[:2, None])
-    np.testing.assert_allclose(found.bins[:2], expected)
-    assert np.isnan(found.bins[2]).all()
+    np.testing.assert_allclose(errors.bins[:2], expected)
+    assert np.isnan(errors.bins[2]).all()
     # Divided by j, an error of the real part turns the response, one of the imaginary enlarges it.
-    np.testing.assert_allclose(found.rounding[0], np.diag([0.01, 0.04]), atol=1e-15)
-    np.testing.assert_allclose(found.rounding[1], np.diag([0.01, 0.0025]), atol=1e-15)
-    np.testing.assert_allclose(found.steps[0], [0.02, 0.08], atol=1e-15)
-    np.testing.assert_allclose(found.turn, [0.0, 0.5, 1.0])
-    some = found.select([2, 0])
+    np.testing.assert_allclose(errors.rounding[0], np.diag([0.01, 0.04]), atol=1e-15)
+    np.testing.assert_allclose(errors.rounding[1], np.diag([0.01, 0.0025]), atol=1e-15)
+    np.testing.assert_allclose(errors.steps[0], [0.02, 0.08], atol=1e-15)
+    np.testing.assert_allclose(errors.turn, [0.0, 0.5, 1.0])
+    some = errors.select([2, 0])
     np.testing.assert_array_equal(some.turn, [1.0, 0.0])
-    np.testing.assert_array_equal(some.bins[1], found.bins[0])
-    np.testing.assert_array_equal(some.steps[1], found.steps[0])
-    np.testing.assert_array_equal(some.rounding[1], found.rounding[0])
+    np.testing.assert_array_equal(some.bins[1], errors.bins[0])
+    np.testing.assert_array_equal(some.steps[1], errors.steps[0])
+    np.testing.assert_array_equal(some.rounding[1], errors.rounding[0])
     with pytest.raises(dataclasses.FrozenInstanceError):
         some.turn = None
     assert isinstance(some, ResponseErrors)
@@ -196,8 +196,8 @@ def test_parts_far_apart_still_have_an_interval():
 
 def test_a_positive_quantity_has_its_weighted_quantiles():
     draws = np.exp(RNG.normal(1.0, 0.5, 20_000))
-    found = positive_interval(draws, np.full(draws.size, 1 / draws.size))
-    np.testing.assert_allclose(found, np.quantile(draws, [0.5, 0.025, 0.975]), rtol=1e-3)
+    quantiles = positive_interval(draws, np.full(draws.size, 1 / draws.size))
+    np.testing.assert_allclose(quantiles, np.quantile(draws, [0.5, 0.025, 0.975]), rtol=1e-3)
     three = positive_interval(np.array([4.0, 1.0, 2.0]), np.array([0.25, 0.25, 0.5]))
     assert three == pytest.approx((2.0, 1.0, 4.0))  # running middles: 0.125, 0.5, 0.875
 

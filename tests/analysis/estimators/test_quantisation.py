@@ -125,12 +125,14 @@ def test_contrasts_of_rounded_joints():
     _, bins = residual_spectrum(series, fit)
     exact = ResidualBins(0 * bins.values, bins.offset, bins.spread, 0 * bins.rounding)
     errors = response_errors(truth, exact, fit.fundamental, bins)
-    found = np.log(fit.fundamental / truth).reshape(runs, joints)
-    each = np.eye(joints) - (1 - np.eye(joints)) / (joints - 1)
+    deviation = np.log(fit.fundamental / truth).reshape(runs, joints)
+    contrasts = np.eye(joints) - (1 - np.eye(joints)) / (joints - 1)
     inside = []
     for run in range(runs):
-        own = errors.select(range(run * joints, (run + 1) * joints))
-        for scatter, value in zip(scatter_of(own), (found[run].real, found[run].imag), strict=True):
-            half = stdtrit(scatter.columns.shape[1], 0.975) * scatter.variance(each) ** 0.5
-            inside.append(np.mean(np.abs(each @ value) <= half))
+        errors_of_run = errors.select(range(run * joints, (run + 1) * joints))
+        for scatter, value in zip(
+            scatter_of(errors_of_run), (deviation[run].real, deviation[run].imag), strict=True
+        ):
+            half = stdtrit(scatter.columns.shape[1], 0.975) * scatter.variance(contrasts) ** 0.5
+            inside.append(np.mean(np.abs(contrasts @ value) <= half))
     assert np.mean(inside) > 0.92

@@ -48,12 +48,12 @@ def test_a_gap_is_more_than_three_median_steps():
 
 def test_raw_samples_are_put_in_order():
     t_ns = np.array([30, 10, 20, 20, 40, 50])
-    found = clean("q", t_ns, np.array([3.0, 1.0, 2.0, 9.0, np.nan, 2 * LARGEST]), 10)
-    np.testing.assert_allclose(found.t_s, [0.0, 1e-8, 2e-8])
-    np.testing.assert_array_equal(found.values, [1.0, 2.0, 3.0])
-    assert (found.dropped_nan, found.dropped_duplicates) == (2, 1)
+    cleaned = clean("q", t_ns, np.array([3.0, 1.0, 2.0, 9.0, np.nan, 2 * LARGEST]), 10)
+    np.testing.assert_allclose(cleaned.t_s, [0.0, 1e-8, 2e-8])
+    np.testing.assert_array_equal(cleaned.values, [1.0, 2.0, 3.0])
+    assert (cleaned.dropped_nan, cleaned.dropped_duplicates) == (2, 1)
     assert clean("q", t_ns[:1], np.array([-LARGEST]), 0).count == 1
-    assert not found.t_s.flags.writeable
+    assert not cleaned.t_s.flags.writeable
     whole = np.array([1, 2, 3])
     assert clean("q", t_ns[:3] * 0 + [1, 2, 3], whole, 0).values.dtype == np.float64
     values = np.array([1.0, 2.0])
@@ -65,8 +65,8 @@ def test_raw_samples_are_put_in_order():
 
 def test_unix_times_keep_their_nanoseconds():
     origin = 1_700_000_000_123_456_789
-    found = clean("q", origin + np.array([1, 1_000_000_003]), np.zeros(2), origin)
-    np.testing.assert_allclose(found.t_s, [1e-9, 1.000000003], rtol=0, atol=1e-16)
+    cleaned = clean("q", origin + np.array([1, 1_000_000_003]), np.zeros(2), origin)
+    np.testing.assert_allclose(cleaned.t_s, [1e-9, 1.000000003], rtol=0, atol=1e-16)
 
 
 def test_signals_of_one_times_share_them():
@@ -77,12 +77,12 @@ def test_signals_of_one_times_share_them():
         "c": Signal("c", "rad", t_ns, np.ones(3)),
         "d": Signal("d", "rad", t_ns.copy(), np.ones(3)),
     }
-    found = clean_together(signals, 0)
-    assert found["c"].t_s is found["a"].t_s
-    assert found["b"].t_s.tolist() == [0.0, 2e-8]
-    assert found["b"].dropped_nan == 1
-    assert found["d"].t_s is not found["a"].t_s
-    assert (found["c"].name, found["c"].values.tolist()) == ("c", [1.0] * 3)
+    cleaned = clean_together(signals, 0)
+    assert cleaned["c"].t_s is cleaned["a"].t_s
+    assert cleaned["b"].t_s.tolist() == [0.0, 2e-8]
+    assert cleaned["b"].dropped_nan == 1
+    assert cleaned["d"].t_s is not cleaned["a"].t_s
+    assert (cleaned["c"].name, cleaned["c"].values.tolist()) == ("c", [1.0] * 3)
 
 
 def test_weights_are_half_of_the_steps_on_either_side():

@@ -36,12 +36,14 @@ def test_raw_samples_are_sorted_and_sorted_out_as_in_a_loop():
         finite = [k for k in range(count) if abs(values[k]) <= LARGEST]
         ordered = sorted(finite, key=lambda k: t_ns[k])
         firsts = [k for i, k in enumerate(ordered) if i == 0 or t_ns[ordered[i - 1]] != t_ns[k]]
-        found = clean("q", t_ns, values, 480)
-        np.testing.assert_array_equal(found.values, values[firsts])
-        np.testing.assert_allclose(found.t_s, [(t_ns[k] - 480) * 1e-9 for k in firsts], rtol=1e-15)
-        assert found.dropped_nan == count - len(finite)
-        assert found.dropped_duplicates == len(finite) - len(firsts)
-        assert not found.values.flags.writeable
+        cleaned = clean("q", t_ns, values, 480)
+        np.testing.assert_array_equal(cleaned.values, values[firsts])
+        np.testing.assert_allclose(
+            cleaned.t_s, [(t_ns[k] - 480) * 1e-9 for k in firsts], rtol=1e-15
+        )
+        assert cleaned.dropped_nan == count - len(finite)
+        assert cleaned.dropped_duplicates == len(finite) - len(firsts)
+        assert not cleaned.values.flags.writeable
 
 
 def test_a_series_without_samples_has_no_period_and_lost_nothing():
@@ -58,15 +60,15 @@ def test_signals_with_the_largest_numbers_share_their_times_too():
         "large": np.array([LARGEST, -LARGEST, 0.0]),
         "beyond": np.array([0.0, 1.01 * LARGEST, 0.0]),
     }
-    found = clean_together({k: Signal(k, "N", t_ns, row) for k, row in rows.items()}, 0)
-    assert found["large"].t_s is found["whole"].t_s
-    assert not found["large"].values.flags.writeable
-    assert found["beyond"].dropped_nan == 1
+    cleaned = clean_together({k: Signal(k, "N", t_ns, row) for k, row in rows.items()}, 0)
+    assert cleaned["large"].t_s is cleaned["whole"].t_s
+    assert not cleaned["large"].values.flags.writeable
+    assert cleaned["beyond"].dropped_nan == 1
     # The first one lost a sample: its times are its own, those of the next are shared.
     first_lost = {"beyond": rows["beyond"], "whole": rows["whole"], "large": rows["large"]}
-    found = clean_together({k: Signal(k, "N", t_ns, row) for k, row in first_lost.items()}, 0)
-    assert [one.count for one in found.values()] == [2, 3, 3]
-    assert found["large"].t_s is found["whole"].t_s
+    cleaned = clean_together({k: Signal(k, "N", t_ns, row) for k, row in first_lost.items()}, 0)
+    assert [series.count for series in cleaned.values()] == [2, 3, 3]
+    assert cleaned["large"].t_s is cleaned["whole"].t_s
 
 
 def test_a_channel_moves_by_more_than_rounding():
@@ -87,7 +89,7 @@ def random_steps():
 
 def test_gaps_are_those_of_a_plain_median():
     for step in random_steps():
-        expected = [k for k, one in enumerate(step) if one > 3 * statistics.median(step)]
+        expected = [k for k, interval in enumerate(step) if interval > 3 * statistics.median(step)]
         assert gaps_after(step).tolist() == expected
 
 
@@ -99,7 +101,7 @@ def test_weights_are_those_of_a_loop():
         start, stop = t[0] - before, t[-1] + after
         half = [(before + after) / 2, *(step / 2), (before + after) / 2]
         usual = statistics.median(step) / 2
-        half = [usual if one > 3 * usual else one for one in half]
+        half = [usual if width > 3 * usual else width for width in half]
         expected = [half[k] + half[k + 1] for k in range(t.size)]
         np.testing.assert_allclose(sample_weights(t, start, stop), expected)
         share = min(1.0, sum(expected) / (stop - start))

@@ -39,12 +39,12 @@ def test_the_fewest_cycles_have_the_fewest_trends():
 
 def test_transients_decay_and_turn_by_their_parameters():
     place = np.arange(5.0)
-    found = transients(place, np.array([1.0, 2.0]), np.array([0.5, 1.0]))
-    assert (found.kind, found.free, found.longest) == ("ringing", 2, 2.0)
-    assert list(zip(found.tau, found.turn, strict=True)) == [(1, 0.5), (1, 1), (2, 0.5), (2, 1)]
-    np.testing.assert_allclose(found.designs[2, :, 0], 1.0)
-    np.testing.assert_allclose(found.designs[2, :, 1], np.exp(-place / 2) * np.cos(0.5 * place))
-    np.testing.assert_allclose(found.designs[2, :, 2], np.exp(-place / 2) * np.sin(0.5 * place))
+    family = transients(place, np.array([1.0, 2.0]), np.array([0.5, 1.0]))
+    assert (family.kind, family.free, family.longest) == ("ringing", 2, 2.0)
+    assert list(zip(family.tau, family.turn, strict=True)) == [(1, 0.5), (1, 1), (2, 0.5), (2, 1)]
+    np.testing.assert_allclose(family.designs[2, :, 0], 1.0)
+    np.testing.assert_allclose(family.designs[2, :, 1], np.exp(-place / 2) * np.cos(0.5 * place))
+    np.testing.assert_allclose(family.designs[2, :, 2], np.exp(-place / 2) * np.sin(0.5 * place))
     plain = transients(place, np.array([3.0]), np.zeros(1))
     assert (plain.kind, plain.free, plain.designs.shape) == ("settling", 1, (1, 5, 2))
     np.testing.assert_allclose(plain.designs[0, :, 1], np.exp(-place / 3))

@@ -21,11 +21,13 @@ def best_linear_approximation(inputs, outputs, lines):
     """Of one input and one output, from samples of whole steady periods, shape (M, P, n)."""
     length = inputs.shape[2]
     u, y = (np.fft.rfft(values, axis=2)[:, :, lines] / length for values in (inputs, outputs))
-    each = [
-        realisation_response(input_inverse(one.mean(axis=0)[None, None]), out[None])
-        for one, out in zip(u, y, strict=True)
+    responses = [
+        realisation_response(input_inverse(command.mean(axis=0)[None, None]), out[None])
+        for command, out in zip(u, y, strict=True)
     ]
-    return over_realisations(*map(np.stack, zip(*((v[0], n[0]) for v, n in each), strict=True)))
+    return over_realisations(
+        *map(np.stack, zip(*((v[0], n[0]) for v, n in responses), strict=True))
+    )
 
 
 def multisine(rng, lines, realisations, n=N):
@@ -66,13 +68,13 @@ def test_distortion_is_that_of_a_thousand_noise_free_realisations(square, cube):
     free = np.setdiff1d(np.arange(lines.min(), lines.max()), lines)
     power = y[:, lines].mean()
     truth = {k: np.sqrt(y[:, free[free % 2 == k]].mean() / power) for k in (0, 1)}
-    errors, found, odd, even, inside = [], [], [], [], []
+    errors, distortions, odd, even, inside = [], [], [], [], []
     for _ in range(40):
         u = multisine(rng, lines, 10)
         inputs, outputs = periods(u, 0.0, rng), periods(system(u, square, cube), 0.02, rng)
         estimate = best_linear_approximation(inputs, outputs, lines)
         errors.append(np.mean(np.abs(estimate.value - mean) ** 2 / estimate.total))
-        found.append(estimate.relative_distortion)
+        distortions.append(estimate.relative_distortion)
         spectra = np.fft.rfft(outputs, axis=2) / N
         levels = detection_lines(list(line_power(spectra)), lines)
         odd.append(levels.odd)
@@ -81,7 +83,7 @@ def test_distortion_is_that_of_a_thousand_noise_free_realisations(square, cube):
             [
                 low <= true <= high
                 for (low, high), true in (
-                    (found[-1].ci95, relative),
+                    (distortions[-1].ci95, relative),
                     (odd[-1].ci95, truth[1]),
                     (even[-1].ci95, truth[0]),
                 )
@@ -89,7 +91,7 @@ def test_distortion_is_that_of_a_thousand_noise_free_realisations(square, cube):
         )
     # |e|^2 / total has the distribution F(2, 18), of the mean 18 / 16.
     assert np.mean(errors) == pytest.approx(18 / 16, abs=0.15)
-    for values, true in ((found, relative), (odd, truth[1]), (even, truth[0])):
+    for values, true in ((distortions, relative), (odd, truth[1]), (even, truth[0])):
         got = np.array([value.value for value in values])
         if true > 0.01:  # a typical set of ten realisations, not only their mean
             assert np.sqrt(np.mean(got**2)) == pytest.approx(true, rel=0.1)
@@ -127,8 +129,8 @@ def test_few_realisations_have_wide_intervals():
         for _ in range(60):
             u = multisine(rng, ODD, count)
             y = periods(system(u), 0.05, rng)
-            found = best_linear_approximation(periods(u, 0.0, rng), y, ODD).relative_distortion
-            inside.append(found.ci95[0] == 0.0)
+            distortion = best_linear_approximation(periods(u, 0.0, rng), y, ODD).relative_distortion
+            inside.append(distortion.ci95[0] == 0.0)
         assert np.mean(inside) >= 0.85
 
 
@@ -147,17 +149,17 @@ def test_orthogonal_inputs_identify_every_response(joints):
         y = y + sigma / np.sqrt(2) * (rng.normal(size=y.shape) + 1j * rng.normal(size=y.shape))
         value, noise = realisation_response(input_inverse(u), y)
         errors.append((np.abs(value - exact) ** 2, noise))
-    squared, said = np.mean(errors, axis=(0, 2, 3))
+    squared, stated = np.mean(errors, axis=(0, 2, 3))
     assert squared == pytest.approx(sigma**2 / P / joints, rel=0.1)
-    assert said == pytest.approx(squared, rel=0.1)
+    assert stated == pytest.approx(squared, rel=0.1)
 
 
 def test_what_one_record_can_not_say_is_missing():
     rng = np.random.default_rng(4)
     u = multisine(rng, ODD, 1)
-    one = best_linear_approximation(u[:, None], system(u)[:, None], ODD)
-    assert np.isnan(one.noise).all()
-    assert np.isnan(one.distortion).all()
+    estimate = best_linear_approximation(u[:, None], system(u)[:, None], ODD)
+    assert np.isnan(estimate.noise).all()
+    assert np.isnan(estimate.distortion).all()
     several = best_linear_approximation(periods(u, 0.0, rng), periods(system(u), 0.01, rng), ODD)
     assert np.isfinite(several.noise).all()
     assert np.isnan(several.total).all()

@@ -56,11 +56,11 @@ def measured(system, rng, realisations, spread):
     outputs = system(np.fft.irfft(inputs, N, axis=1))[:, None]
     noise = 0.02 * rng.standard_normal((realisations, PERIODS, N))
     y = np.fft.rfft(outputs + noise, axis=2)
-    each = [
+    pairs = [
         realisation_response(input_inverse(u[None, None, LINES]), out[None][:, :, LINES])
         for u, out in zip(inputs, y, strict=True)
     ]
-    values, noises = (np.stack([pair[k][0] for pair in each]) for k in (0, 1))
+    values, noises = (np.stack([pair[k][0] for pair in pairs]) for k in (0, 1))
     whole = over_realisations(values, noises, spread.excited)
     powers = [line_power(out[None]).mean(axis=0) for out in y]
     beside = detection_lines(powers, LINES, spread)
@@ -73,15 +73,15 @@ def test_intervals_of_levels_hold_the_truth(name, realisations):
     """At least 92 %: 86 of 100 (99 % of a binomial distribution)."""
     rng, exact = np.random.default_rng(realisations), truth(SYSTEMS[name])
     spread = distortion_spread(LINES, np.ones(LINES.size), realisations)
-    held, known = np.zeros(3), np.zeros(3)
+    held, stated = np.zeros(3), np.zeros(3)
     for _ in range(100):
         levels = measured(SYSTEMS[name], rng, realisations, spread)
         for k, (level, true) in enumerate(zip(levels, exact, strict=True)):
             if level.ci95 is not None:
-                known[k] += 1
+                stated[k] += 1
                 held[k] += level.ci95[0] <= true <= level.ci95[1]
-    assert known.tolist() == [0 if realisations == 1 else 100, 100, 100]
-    assert (held >= 0.86 * known).all(), held
+    assert stated.tolist() == [0 if realisations == 1 else 100, 100, 100]
+    assert (held >= 0.86 * stated).all(), held
 
 
 def test_of_more_realisations_the_spread_is_narrower():

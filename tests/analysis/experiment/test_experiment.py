@@ -104,11 +104,14 @@ def test_a_weak_module_is_named(weak):
         "the modules differ: joint07 answers less than its mirror joint19 (p = 0.002): "
         "joint07 weaker or joint19 stronger"
     )
-    (one,) = result.reversal.pairs
+    (pair,) = result.reversal.pairs
     assert (result.reversal.tilt.headings, result.reversal.tilt.excluded) == ("unknown", True)
     assert result.reversal.middle == "joint13"
-    assert (one.name, one.mirror) == ("joint07", "joint19")
-    for estimate, truth in ((one.log_gain_contrast, math.log(0.96)), (one.lag_contrast_rad, 0.02)):
+    assert (pair.name, pair.mirror) == ("joint07", "joint19")
+    for estimate, truth in (
+        (pair.log_gain_contrast, math.log(0.96)),
+        (pair.lag_contrast_rad, 0.02),
+    ):
         low, high = estimate.ci95
         assert low < truth < high
         assert high - low < 0.01
@@ -166,8 +169,8 @@ def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
     assert [run.role for run in result.runs[:12]] == ["forward", "reverse"] * 6
     assert all(run.role is None for run in result.runs[12:])
     assert (result.reversal.forward_runs, result.reversal.reverse_runs) == (6, 6)
-    for k, found in enumerate(odd):
-        assert found in result.runs[12 + k].why
+    for k, reason in enumerate(odd):
+        assert reason in result.runs[12 + k].why
         assert any(w.startswith(f"odd{k}.mcap ") for w in result.warnings)
     assert "a copy is not a run of its own" in result.runs[-1].why
 
@@ -222,7 +225,9 @@ def test_the_json_object(weak, tmp_path, report_of):
     keys = "answer sessions runs heterogeneity reversal pooled coupling oscillators best_linear"
     keys += " body_connection"
     assert list(printed) == [*keys.split(), "warnings", "provenance"]
-    assert [one["session"]["path"] for one in printed["sessions"]] == [str(path) for path in weak]
+    assert [session["session"]["path"] for session in printed["sessions"]] == [
+        str(path) for path in weak
+    ]
     reversal = printed["reversal"]
     assert reversal["p"] == pytest.approx(2 / 924)
     assert (reversal["pairs"][0]["name"], len(reversal["joints"])) == ("joint07", M)

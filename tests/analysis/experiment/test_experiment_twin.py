@@ -29,7 +29,7 @@ def driven(tmp_path, command):
     """Drives the commands of a folder on the twin of a world; returns the sessions' paths."""
 
     def drive(folder, world):
-        paths = [tmp_path / f"{world.stem}-{one.name}" for one in sorted(folder.glob("*.mcap"))]
+        paths = [tmp_path / f"{world.stem}-{file.name}" for file in sorted(folder.glob("*.mcap"))]
         for path in paths:
             commands = folder / path.name.removeprefix(f"{world.stem}-")
             command("drive", commands, "--on", f"twin:{world}", "-o", path)
@@ -98,8 +98,8 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, driven, command, re
         answers[name, "balanced"] = report_of("analyse", *paths)
         answers[name, "one heading"] = report_of("analyse", *at_one_heading)
     sound, weak = (answers[name, "balanced"] for name in ("sound", "weak"))
-    for one in (sound, weak):
-        reversal = one["reversal"]
+    for report in (sound, weak):
+        reversal = report["reversal"]
         assert (reversal["forward_runs"], reversal["reverse_runs"]) == (6, 6)
         assert reversal["labellings"] == 400
         assert (reversal["tilt"]["headings"], reversal["tilt"]["strata"]) == ("balanced", 2)
@@ -113,11 +113,11 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, driven, command, re
     assert (alone["forward_runs"], alone["reverse_runs"]) == (3, 3)
     tilt = alone["tilt"]
     assert (tilt["headings"], tilt["excluded"]) == ("unbalanced", False)
-    one, two = (
-        max(abs(joint["lag_difference_rad"]["value"]) for joint in each["joints"])
-        for each in (alone, sound["reversal"])
+    unbalanced, balanced = (
+        max(abs(joint["lag_difference_rad"]["value"]) for joint in reversal["joints"])
+        for reversal in (alone, sound["reversal"])
     )
-    assert one > 5 * two
+    assert unbalanced > 5 * balanced
 
 
 @pytest.mark.built("tables")
@@ -140,6 +140,6 @@ def test_kicks_in_contact_predict_what_was_held_out(tmp_path, driven, command, r
     # Servos that the ground slows down are no linear chain.
     assert coupling["nonlinearity"]["ci95"][0] > 0.02
     assert len(coupling["held_out"]) == 3
-    for one in coupling["held_out"]:
-        assert 2 * one["error"] < one["error_kept"]
+    for pattern in coupling["held_out"]:
+        assert 2 * pattern["error"] < pattern["error_kept"]
     assert coupling["valid_to"] > 0.1

@@ -79,8 +79,8 @@ def test_a_linear_chain_is_found_linear(result):
     np.testing.assert_allclose(np.array(coupling.lti.real), H.real, atol=error)
     np.testing.assert_allclose(np.array(coupling.lti.imag), H.imag, atol=error)
     X, lti = np.linalg.inv(H), coupling.lti
-    for found, truth in ((lti.asymmetry, asymmetry(X)), (lti.within_1, within(X, 1))):
-        assert found.ci95[0] <= truth <= found.ci95[1]
+    for estimate, truth in ((lti.asymmetry, asymmetry(X)), (lti.within_1, within(X, 1))):
+        assert estimate.ci95[0] <= truth <= estimate.ci95[1]
 
 
 def test_what_oscillators_would_do_on_this_body(result):
@@ -109,11 +109,11 @@ def test_what_oscillators_would_do_on_this_body(result):
 
 def test_held_out_runs_are_predicted(result):
     coupling = result.coupling
-    assert [one.session for one in coupling.held_out] == ["run21.mcap", "run22.mcap"]
-    for one in coupling.held_out:
-        assert 2 * one.error < one.error_kept
-        assert 0.05 < one.size <= 0.2
-    assert coupling.valid_to == max(one.size for one in coupling.held_out)
+    assert [pattern.session for pattern in coupling.held_out] == ["run21.mcap", "run22.mcap"]
+    for pattern in coupling.held_out:
+        assert 2 * pattern.error < pattern.error_kept
+        assert 0.05 < pattern.size <= 0.2
+    assert coupling.valid_to == max(pattern.size for pattern in coupling.held_out)
 
 
 def test_roles_warnings_and_text(result, sessions):

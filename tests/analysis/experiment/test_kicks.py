@@ -63,7 +63,7 @@ def run_all(system, command, kicks, turns=None):
     deviation = np.log(commands / command)
     if turns is not None:
         commands = commands * np.exp(1j * turns)[:, None]
-        deviation = np.stack([deviation_of(one, command) for one in commands])
+        deviation = np.stack([deviation_of(kicked, command) for kicked in commands])
     ratio = np.stack([system(command) / command for command in commands])
     return deviation + np.log(ratio / (system(command) / command))
 
@@ -117,8 +117,8 @@ def test_intervals_cover_what_was_planted():
     kicks = plan(m=3)
     log = run_all(lambda c: H @ c, command, kicks)
     clean = measure(log, kicks)
-    truth = np.stack([one.value for one in clean])
-    sums = [row_sums(one).value for one in clean[:2]]
+    truth = np.stack([matrix.value for matrix in clean])
+    sums = [row_sums(matrix).value for matrix in clean[:2]]
     rng = np.random.default_rng(7)
     sigma, dof, count = 1e-3, 8, 3000
     inside, rows = np.zeros(truth.shape), np.zeros((2, 3))
@@ -126,10 +126,10 @@ def test_intervals_cover_what_was_planted():
         log_noisy = noisy(rng, log, sigma)
         estimated = sigma**2 * rng.chisquare(dof, (2, *log.shape)) / dof
         P, R, G, S = measure(log_noisy, kicks, estimated, float(dof))
-        for k, one in enumerate((P, R, G, S)):
-            inside[k] += np.abs(one.value - truth[k]) <= one.half
-        for k, one in enumerate((P, R)):
-            total = row_sums(one)
+        for k, matrix in enumerate((P, R, G, S)):
+            inside[k] += np.abs(matrix.value - truth[k]) <= matrix.half
+        for k, matrix in enumerate((P, R)):
+            total = row_sums(matrix)
             rows[k] += np.abs(total.value - sums[k]) <= 2.0 * total.error  # 95.4 % of a Gaussian
     for covered in (inside / count, rows / count):
         assert 0.93 < covered.min() <= covered.max() < 0.97
@@ -189,7 +189,9 @@ def test_the_linear_reading_gives_back_what_was_planted(reciprocal):
     np.testing.assert_allclose(reading.real, H.real, atol=1e-7)
     np.testing.assert_allclose(reading.imag, H.imag, atol=1e-7)
     assert reading.condition_number == pytest.approx(np.linalg.cond(H), rel=1e-6)
-    assert [one.value for one in shape(reading)] == pytest.approx(planted_shape(H), abs=1e-6)
+    assert [estimate.value for estimate in shape(reading)] == pytest.approx(
+        planted_shape(H), abs=1e-6
+    )
     # Also where the coupling isn't directed: an asymmetric P is no sign of that.
     assert np.linalg.norm(P.value - P.value.T) > 0.1
 
@@ -205,8 +207,11 @@ def test_the_intervals_of_the_linear_reading_cover(reciprocal):
     sigma, covered = 1e-4, np.zeros(4)
     for _ in range(100):
         P, R, *_ = measure(noisy(rng, log, sigma), kicks, sigma**2, 40.0)
-        found = shape(lti_reading(P, R, H @ command, command))
-        covered += [one.ci95[0] <= t <= one.ci95[1] for one, t in zip(found, truth, strict=True)]
+        shapes = shape(lti_reading(P, R, H @ command, command))
+        covered += [
+            estimate.ci95[0] <= t <= estimate.ci95[1]
+            for estimate, t in zip(shapes, truth, strict=True)
+        ]
     assert covered.min() >= 95  # conservative by construction
 
 
@@ -224,19 +229,19 @@ def test_held_out_patterns_tell_how_far_it_holds():
     P, R, G, S = measure(run_all(lambda c: H @ c, command, kicks), kicks)
     response = H @ command
     rng = np.random.default_rng(2)
-    found = []
+    predictions = []
     shape = rng.uniform(-1, 1, M)
     for size in (0.05, 0.15, 0.6):
         deviation = 1j * size * shape
         answered = np.log(H @ (command * np.exp(deviation)) / response)
-        matrices = tuple(one.value for one in (P, R, G, S))
-        found.append(predict(deviation, answered, np.zeros(M), response, matrices))
-    errors = [one.error for one in found]
+        matrices = tuple(matrix.value for matrix in (P, R, G, S))
+        predictions.append(predict(deviation, answered, np.zeros(M), response, matrices))
+    errors = [prediction.error for prediction in predictions]
     assert errors[0] < errors[1] < errors[2]
     # What is left is of second order: nine times as much at three times the size.
     assert 7 < errors[1] / errors[0] < 11
-    assert found[0].error_kept / found[0].error > 10
-    assert (valid_to(found[:2]), valid_to([])) == (found[1].size, None)
+    assert predictions[0].error_kept / predictions[0].error > 10
+    assert (valid_to(predictions[:2]), valid_to([])) == (predictions[1].size, None)
 
 
 def test_kicks_are_estimated_from_phasors():
@@ -246,14 +251,16 @@ def test_kicks_are_estimated_from_phasors():
     pattern = command * np.exp(0.15j * np.array([1, -1, 0.5, 0.2, -0.7]))
     runs = [command, command, *(kicked(command, kick) for kick in kicks), pattern]
     order = rng.permutation(len(runs))
-    found = sort_kicks(np.stack([runs[k] * np.exp(1j * rng.uniform(-np.pi, np.pi)) for k in order]))
-    assert {int(order[k]) for k in found.base} == {0, 1}
-    assert [int(order[k]) for k in found.patterns] == [len(runs) - 1]
-    for k, kick in found.kicks.items():
+    sorted_kicks = sort_kicks(
+        np.stack([runs[k] * np.exp(1j * rng.uniform(-np.pi, np.pi)) for k in order])
+    )
+    assert {int(order[k]) for k in sorted_kicks.base} == {0, 1}
+    assert [int(order[k]) for k in sorted_kicks.patterns] == [len(runs) - 1]
+    for k, kick in sorted_kicks.kicks.items():
         truth = kicks[order[k] - 2]
         assert (kick.joint, kick.kind) == (truth.joint, truth.kind)
         assert kick.size == pytest.approx(truth.size, abs=1e-12)
-    assert missing_kicks(list(found.kicks.values()), KickKind.PHASE, NAMES) == ()
+    assert missing_kicks(list(sorted_kicks.kicks.values()), KickKind.PHASE, NAMES) == ()
 
 
 def test_what_is_no_kick():
@@ -266,7 +273,7 @@ def test_what_is_no_kick():
 
 def test_one_sided_kicks_are_refused():
     H, command = planted()
-    kicks = [one for one in plan() if one.size > 0 or one.joint != 2]
+    kicks = [kick for kick in plan() if kick.size > 0 or kick.joint != 2]
     assert missing_kicks(kicks, KickKind.PHASE, NAMES) == ("waist only up",)
     uneven = [Kick(0, KickKind.PHASE, 0.05), Kick(0, KickKind.PHASE, -0.03)]
     missing = missing_kicks(uneven, KickKind.PHASE, NAMES)

@@ -67,13 +67,13 @@ def planned(like, tmp_path, report_of):
     return plan
 
 
-def inside(found, exact):
-    ends = np.array(found["response"]["gain_ci95"])
+def inside(joint, exact):
+    ends = np.array(joint["response"]["gain_ci95"])
     return (ends[:, 0] <= np.abs(exact)) & (np.abs(exact) <= ends[:, 1])
 
 
-def exact_response(found):
-    hz = np.array(found["response"]["frequency_hz"])
+def exact_response(joint):
+    hz = np.array(joint["response"]["frequency_hz"])
     return signal.freqz(*FILTER, worN=hz, fs=RATE_HZ)[1]
 
 
@@ -82,16 +82,18 @@ def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command)
     result = report_of("analyse", *files)
     best = result["best_linear"]
     assert (best["realisations"], best["periods"], best["inputs"]) == (4, 2, "same")
-    assert [one["response"]["joint"] for one in best["joints"]] == [*NAMES]
-    for one in best["joints"]:
-        assert inside(one, exact_response(one)).mean() >= 0.8  # of 12 lines
-        np.testing.assert_allclose(one["response"]["gain"], np.abs(exact_response(one)), atol=0.005)
-        assert one["distortion"]["ci95"][0] == 0.0
-        assert one["distortion"]["value"] < 0.01
-        assert one["odd"]["value"] < 0.01
-        assert one["even"]["value"] < 0.01
-        assert one["response"]["shares_command"] == [
-            name for name in NAMES if name != one["response"]["joint"]
+    assert [joint["response"]["joint"] for joint in best["joints"]] == [*NAMES]
+    for joint in best["joints"]:
+        assert inside(joint, exact_response(joint)).mean() >= 0.8  # of 12 lines
+        np.testing.assert_allclose(
+            joint["response"]["gain"], np.abs(exact_response(joint)), atol=0.005
+        )
+        assert joint["distortion"]["ci95"][0] == 0.0
+        assert joint["distortion"]["value"] < 0.01
+        assert joint["odd"]["value"] < 0.01
+        assert joint["even"]["value"] < 0.01
+        assert joint["response"]["shares_command"] == [
+            name for name in NAMES if name != joint["response"]["joint"]
         ]
     assert "no nonlinear distortion is shown" in result["answer"]
     page = tmp_path / "page.html"
@@ -104,15 +106,15 @@ def test_a_linear_servo_has_no_distortion(planned, tmp_path, report_of, command)
 def test_odd_and_even_order_are_separated(order, planned, tmp_path, report_of):
     bent = {"cube": 2.5} if order == "odd" else {"square": 1.0}
     files = drive(planned("--realisations", 4), tmp_path, **bent)
-    one, _ = report_of("analyse", *files)["best_linear"]["joints"]
+    joint, _ = report_of("analyse", *files)["best_linear"]["joints"]
     if order == "odd":
-        assert one["odd"]["value"] > 0.02
-        assert one["even"]["value"] < 0.01
-        assert one["distortion"]["ci95"][0] > 0.01
+        assert joint["odd"]["value"] > 0.02
+        assert joint["even"]["value"] < 0.01
+        assert joint["distortion"]["ci95"][0] > 0.01
     else:
-        assert one["even"]["value"] > 0.05
-        assert one["odd"]["value"] < 0.01
-        assert one["distortion"]["value"] < 0.01  # a square makes no odd lines of odd lines
+        assert joint["even"]["value"] > 0.05
+        assert joint["odd"]["value"] < 0.01
+        assert joint["distortion"]["value"] < 0.01  # a square makes no odd lines of odd lines
 
 
 def test_sessions_without_a_plan_are_recognised_by_their_commands(planned, tmp_path, report_of):
@@ -127,11 +129,11 @@ def test_orthogonal_commands_give_the_response_to_each_other_joint(planned, tmp_
     files = drive(planned("--realisations", 2, "--inputs", "orthogonal"), tmp_path, mix=mix)
     best = report_of("analyse", *files)["best_linear"]
     exact = exact_response(best["joints"][0])
-    for k, one in enumerate(best["joints"]):
-        np.testing.assert_allclose(one["response"]["gain"], mix[k, k] * np.abs(exact), atol=0.01)
-    found = {(one["joint"], one["command"]): one for one in best["cross"]}
-    np.testing.assert_allclose(found["a", "b"]["gain"], 0.3 * np.abs(exact), atol=0.01)
-    turned = np.exp(-1j * np.array(found["b", "a"]["lag_rad"])) * found["b", "a"]["gain"]
+    for k, joint in enumerate(best["joints"]):
+        np.testing.assert_allclose(joint["response"]["gain"], mix[k, k] * np.abs(exact), atol=0.01)
+    cross = {(response["joint"], response["command"]): response for response in best["cross"]}
+    np.testing.assert_allclose(cross["a", "b"]["gain"], 0.3 * np.abs(exact), atol=0.01)
+    turned = np.exp(-1j * np.array(cross["b", "a"]["lag_rad"])) * cross["b", "a"]["gain"]
     np.testing.assert_allclose(turned, -0.2 * exact, atol=0.01)
     left = report_of("analyse", *files[:3])
     assert left["best_linear"]["realisations"] == 1
@@ -145,9 +147,9 @@ def test_one_period_or_realisation_separates_nothing(words, what, planned, tmp_p
     count = 1 if "--runs" in words else 3
     files = drive(planned("--realisations", count, *words), tmp_path, cube=2.5)
     result = report_of("analyse", *files)
-    for one in result["best_linear"]["joints"]:
-        assert one["distortion"] == {"value": None, "ci95": None}
-        assert one["distortion_sd"] is None
+    for joint in result["best_linear"]["joints"]:
+        assert joint["distortion"] == {"value": None, "ci95": None}
+        assert joint["distortion_sd"] is None
     assert "not separable from noise" in result["answer"]
     assert any(warning.startswith(what) for warning in result["warnings"])
 

@@ -72,14 +72,16 @@ def test_it_is_generalised_least_squares():
         r = y - f
         return np.sum((r.real**2 + r.imag**2) / seen.lag_variance) + np.sum(x**2) / 0.2**2
 
-    found = verdict(seen, model)
+    judgement = verdict(seen, model)
     free = minimize(q, np.zeros(3), tol=1e-10)
-    assert (found.fit, found.named) == (pytest.approx(free.fun, rel=1e-6), (2,))
+    assert (judgement.fit, judgement.named) == (pytest.approx(free.fun, rel=1e-6), (2,))
     other = minimize(q, np.zeros(5), args=(2,), tol=1e-10)
-    np.testing.assert_allclose(found.x, other.x[:3], atol=1e-4)
-    np.testing.assert_allclose(found.deviation[2], other.x[3:], atol=0.01 * found.error[2].max())
+    np.testing.assert_allclose(judgement.x, other.x[:3], atol=1e-4)
+    np.testing.assert_allclose(
+        judgement.deviation[2], other.x[3:], atol=0.01 * judgement.error[2].max()
+    )
     # Lambda of a named module is that of the system linear at H2, Q1 isn't: a few per cent apart.
-    assert found.gain[2] == pytest.approx(free.fun - other.fun, rel=0.1)
+    assert judgement.gain[2] == pytest.approx(free.fun - other.fun, rel=0.1)
 
 
 @pytest.mark.nightly
@@ -90,10 +92,10 @@ def test_a_shift_of_the_shared_parameters_is_absorbed(curvature, dof):
     rng = np.random.default_rng(2)
     alarms, misfits, held = 0, 0, 0
     for _ in range(200):
-        found = verdict(answered(rng, model, 0.1 * rng.normal(size=3), dof=dof), model)
-        alarms += bool(found.named)
-        misfits += found.fit_p < 0.05
-        held += (np.abs(found.deviation) <= found.critical * found.error).all()
+        judgement = verdict(answered(rng, model, 0.1 * rng.normal(size=3), dof=dof), model)
+        alarms += bool(judgement.named)
+        misfits += judgement.fit_p < 0.05
+        held += (np.abs(judgement.deviation) <= judgement.critical * judgement.error).all()
     # 200 at 5 %: standard error 1.5 %.
     assert 0.02 < alarms / 200 < 0.085
     assert 0.02 < misfits / 200 < 0.085
@@ -114,11 +116,11 @@ def test_a_weak_module_is_found_and_named(module):
     right = held = 0
     for _ in range(20):
         x = 0.15 * rng.normal(size=3)
-        found = verdict(answered(rng, model, x, [("stall_torque", module, np.log(0.8))]), model)
-        right += found.named[:1] == (module,)
-        off = np.abs(found.deviation[module] - [np.log(0.8), 0.0])
-        held += (off <= found.critical * found.error[module]).all()
-        assert found.fit_p < 0.05
+        judgement = verdict(answered(rng, model, x, [("stall_torque", module, np.log(0.8))]), model)
+        right += judgement.named[:1] == (module,)
+        off = np.abs(judgement.deviation[module] - [np.log(0.8), 0.0])
+        held += (off <= judgement.critical * judgement.error[module]).all()
+        assert judgement.fit_p < 0.05
     assert right == 20
     assert held >= 18
 
@@ -128,11 +130,11 @@ def test_two_modules_are_named_one_after_the_other():
     rng = np.random.default_rng(4)
     changes = [("stall_torque", 1, np.log(0.7)), ("mass", 5, np.log(3.0))]
     seen = answered(rng, model, np.zeros(3), changes)
-    found = verdict(seen, model)
-    assert set(found.named[:2]) == {1, 5}
-    assert found.rest_p > 0.05
-    assert found.deviation[1, 0] == pytest.approx(np.log(0.7), abs=0.1)
-    assert found.deviation[5, 1] == pytest.approx(np.log(3.0), abs=0.3)
+    judgement = verdict(seen, model)
+    assert set(judgement.named[:2]) == {1, 5}
+    assert judgement.rest_p > 0.05
+    assert judgement.deviation[1, 0] == pytest.approx(np.log(0.7), abs=0.1)
+    assert judgement.deviation[5, 1] == pytest.approx(np.log(3.0), abs=0.3)
 
 
 def test_the_models_own_error_is_noise():

@@ -42,8 +42,8 @@ def test_from_the_twin_to_a_named_module(tmp_path, capsys, command):
     shifted = analysed(wave(1.0, 0.265))
     assert shifted["named"] == []
     assert "conditional on the model null.json" in shifted["condition"]
-    found = {one["name"]: one["fitted"]["ci95"] for one in shifted["parameters"]}
-    assert found["stall_torque"][0] < 0.265 < found["stall_torque"][1]
+    fitted = {parameter["name"]: parameter["fitted"]["ci95"] for parameter in shifted["parameters"]}
+    assert fitted["stall_torque"][0] < 0.265 < fitted["stall_torque"][1]
     weak = analysed(wave(1.0, 0.25, **WEAK))
     assert weak["named"][0] == "joint05"
     assert weak["p"] < 0.01

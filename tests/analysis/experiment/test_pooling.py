@@ -68,14 +68,14 @@ def test_the_covariance_is_that_of_the_mean():
 
 def test_one_run_is_itself_and_unknown_joints_are_left_out():
     rng = np.random.default_rng(3)
-    (one,) = drawn(rng, 1, 0.0, 0.003)
-    pooled = pool_runs("abcd", [one])
-    np.testing.assert_allclose(pooled.response.ratio, one.ratio)
-    np.testing.assert_allclose(pooled.response.lag_variance, one.lag_variance)
+    (run,) = drawn(rng, 1, 0.0, 0.003)
+    pooled = pool_runs("abcd", [run])
+    np.testing.assert_allclose(pooled.response.ratio, run.ratio)
+    np.testing.assert_allclose(pooled.response.lag_variance, run.lag_variance)
     assert (pooled.response.dof == 40).all()
     other = drawn(rng, 1, 0.0, 0.003)[0]
     other.ratio[1] = np.nan
-    both = pool_runs("abcd", [one, other])
+    both = pool_runs("abcd", [run, other])
     assert (both.names, both.runs) == (("a", "c", "d"), 2)
     # Phases near pi average to one near pi, not to zero.
     assert abs(abs(np.angle(both.response.ratio[1])) - 3.1) < 0.03

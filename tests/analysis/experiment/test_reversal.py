@@ -52,7 +52,7 @@ def test_one_joint_is_a_permuted_welch_test(runs):
         # Of unequal numbers SciPy doubles the smaller tail, which isn't the share of larger |t|.
         both = np.concatenate([forward.real[:, 0], reverse.real[:, 0]])
         every = every_labelling(*runs)
-        t = [ttest_ind(both[one], both[~one], equal_var=False).statistic for one in every]
+        t = [ttest_ind(both[mask], both[~mask], equal_var=False).statistic for mask in every]
         share = np.mean(np.abs(t) >= np.abs(foreign.statistic[0]) * (1 - 1e-9))
         assert test.p == pytest.approx(share, abs=1e-12)
 
@@ -142,19 +142,19 @@ def test_a_weak_module_is_found_and_named(size):
     names = [f"joint{i + 1:02d}" for i in range(13)]
     module = np.zeros(13, dtype=complex)
     module[9] = -1j * size * scatter * (2 / 6) ** 0.5
-    found = right = 0
+    detected = right = 0
     for _ in range(sets):
         test = mirror_test(*both_ways(rng, pattern(13), module, scatter=scatter))
         pairs = ordered_pairs(names, test)
-        found += test.p < 0.05
+        detected += test.p < 0.05
         first = [(pair.name, pair.mirror, pair.by) for pair in pairs[:1]]
         right += first == [("joint10", "joint04", "lag")]
     missed = nct.cdf(t_distribution.isf(0.05 / 26 / 2, 10), 10, 2**0.5 * size)
-    assert found / sets == pytest.approx(1 - missed, abs=0.09)  # standard error up to 3.5 %
+    assert detected / sets == pytest.approx(1 - missed, abs=0.09)  # standard error up to 3.5 %
     if size >= 3:
-        assert right / found > 0.95
+        assert right / detected > 0.95
     if size >= 9:
-        assert right == found == sets
+        assert right == detected == sets
 
 
 def test_a_strong_module_orders_its_pair():
@@ -217,24 +217,24 @@ def test_shares_in_closed_form():
     rng = np.random.default_rng(8)
     boundary, module = pattern(9), 0.05 * rng.normal(size=9) + 0.05j * rng.normal(size=9)
     shares = variance_shares(*both_ways(rng, boundary, module, scatter=1e-7))
-    own = np.mean(np.abs(module - module[::-1])[np.arange(9) != 4] ** 2) / 2
-    ways = [np.var(one + module, ddof=1) for one in (boundary, boundary[::-1])]
-    assert shares.module_variance.value == pytest.approx(own, rel=1e-5)
-    assert shares.boundary_variance.value == pytest.approx(np.mean(ways) - own, rel=1e-5)
-    assert shares.module_share.value == pytest.approx(own / np.mean(ways), rel=1e-5)
-    assert shares.boundary_share.value == pytest.approx(1 - own / np.mean(ways), rel=1e-5)
+    module_part = np.mean(np.abs(module - module[::-1])[np.arange(9) != 4] ** 2) / 2
+    ways = [np.var(pattern + module, ddof=1) for pattern in (boundary, boundary[::-1])]
+    assert shares.module_variance.value == pytest.approx(module_part, rel=1e-5)
+    assert shares.boundary_variance.value == pytest.approx(np.mean(ways) - module_part, rel=1e-5)
+    assert shares.module_share.value == pytest.approx(module_part / np.mean(ways), rel=1e-5)
+    assert shares.boundary_share.value == pytest.approx(1 - module_part / np.mean(ways), rel=1e-5)
 
 
 def test_noise_is_nobodys_share():
     """Identical modules without any pattern: on average no variance is left, for either."""
     rng = np.random.default_rng(9)
     nothing = (np.zeros(13), np.zeros(13))
-    found = [variance_shares(*both_ways(rng, *nothing, scatter=0.02)) for _ in range(60)]
-    noise = np.mean([one.noise_variance for one in found])
+    shares = [variance_shares(*both_ways(rng, *nothing, scatter=0.02)) for _ in range(60)]
+    noise = np.mean([share.noise_variance for share in shares])
     assert noise == pytest.approx(2 * 0.02**2 / 6, rel=0.1)  # gain and lag
-    assert np.mean([one.module_variance.value for one in found]) < 0.3 * noise
-    assert np.mean([one.boundary_variance.value for one in found]) < 0.3 * noise
-    assert all(one.module_variance.ci95[0] == 0 for one in found[:20])
+    assert np.mean([share.module_variance.value for share in shares]) < 0.3 * noise
+    assert np.mean([share.boundary_variance.value for share in shares]) < 0.3 * noise
+    assert all(share.module_variance.ci95[0] == 0 for share in shares[:20])
 
 
 def test_the_interval_of_the_share_covers():

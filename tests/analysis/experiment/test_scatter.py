@@ -37,19 +37,19 @@ def coupled(experiment):
 )
 def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs):
     random, options = np.random.default_rng(3), {"how": how, "base_runs": base_runs}
-    found = kick_tables.row(random, 50, 5, scatter_deg, **options, index=scatter_deg == 0.1)
-    assert min(found[name] for name in "PRGS") >= 0.91
-    assert found["worst"] >= 0.90  # of one row, 250 elements that share an estimate of scatter
-    assert found["nonlinear"] <= 0.05
-    assert found["rows"] <= 0.12
+    shares = kick_tables.row(random, 50, 5, scatter_deg, **options, index=scatter_deg == 0.1)
+    assert min(shares[name] for name in "PRGS") >= 0.91
+    assert shares["worst"] >= 0.90  # of one row, 250 elements that share an estimate of scatter
+    assert shares["nonlinear"] <= 0.05
+    assert shares["rows"] <= 0.12
     # Not by being wide: at most half more than what the scatter itself makes of a difference.
     sigma = math.hypot(math.radians(scatter_deg), kick_tables.NOISE)
-    assert found["half"] <= 1.5 * 1.96 * math.sqrt(2) * sigma / (2 * kick_tables.KICK)
+    assert shares["half"] <= 1.5 * 1.96 * math.sqrt(2) * sigma / (2 * kick_tables.KICK)
 
 
 def test_without_coupling_the_headline_shows_none():
-    found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
-    assert found["headline"] <= 0.05
+    shares = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
+    assert shares["headline"] <= 0.05
 
 
 def test_nonlinearity_is_still_found():
@@ -70,19 +70,19 @@ def test_the_errors_of_a_run_are_those_planted(common):
     H, c = kick_tables.chain(m)
     random = np.random.default_rng(6)
     L = H * c[None, :] / (H @ c)[:, None]
-    found, correlated = [], []
+    variances, correlated = [], []
     how = {"scatter": sigma, "how": "common" if common else "each"}
     for answers in kick_tables.experiments(random, count, kicks, H, c, **how):
         variance = np.hstack([answers.phase_variance, answers.log_gain_variance])
         errors = run_errors(kicks, answers.log, variance, (L, L))
-        found.append(errors.variance)
+        variances.append(errors.variance)
         correlated.append(errors.correlation[0, 1])
         # Repeats, others' pairs of two kinds, the rows' sum.
         assert errors.dof == 2 + 2 * (m - 2) + 1
     expected = sigma**2 + kick_tables.NOISE**2
-    np.testing.assert_allclose(np.mean(found, axis=0), expected, rtol=0.1)
+    np.testing.assert_allclose(np.mean(variances, axis=0), expected, rtol=0.1)
     # Each estimate has the spread of a mean of seven squares.
-    assert np.std(found, axis=0).mean() == pytest.approx(expected * math.sqrt(2 / 7), rel=0.15)
+    assert np.std(variances, axis=0).mean() == pytest.approx(expected * math.sqrt(2 / 7), rel=0.15)
     if common:  # of few products, and never above 1: a little too small
         assert 0.85 < np.mean(correlated) <= 1.0
     else:
@@ -96,8 +96,10 @@ def test_a_servo_that_saturates_does_not_look_like_scatter():
     for k, kick in enumerate(KICKS):
         if kick is not None and kick.joint == 2:
             bent[k, 2] *= np.exp(2j * kick.size**2)  # 0.3 degrees
-    one, two = (coupled(one) for one in (straight, dataclasses.replace(straight, ratio=bent)))
-    np.testing.assert_allclose(one.P.ci95_half, two.P.ci95_half, rtol=1e-6)
+    steady, two = (
+        coupled(measured) for measured in (straight, dataclasses.replace(straight, ratio=bent))
+    )
+    np.testing.assert_allclose(steady.P.ci95_half, two.P.ci95_half, rtol=1e-6)
 
 
 def test_a_copied_file_is_no_repeat():
@@ -106,9 +108,11 @@ def test_a_copied_file_is_no_repeat():
     (answers,) = kick_tables.experiments(np.random.default_rng(1), 1, kicks, H, c, scatter=1e-3)
     twice = [*kicks, None]
     again = answers.select([*range(len(kicks)), 0])
-    one, two = (local_matrices(k, a, amplitude=True) for k, a in ((kicks, answers), (twice, again)))
-    assert one.errors.dof == two.errors.dof
-    np.testing.assert_allclose(one.P.error, two.P.error)
+    original, two = (
+        local_matrices(k, a, amplitude=True) for k, a in ((kicks, answers), (twice, again))
+    )
+    assert original.errors.dof == two.errors.dof
+    np.testing.assert_allclose(original.P.error, two.P.error)
 
 
 def test_sums_that_fail_widen_and_come_first():
@@ -179,6 +183,8 @@ def test_kicks_of_unusual_size_are_found(size):
     off = np.zeros((11, 5), dtype=complex)
     for k, kick in enumerate(kicks, start=1):
         off[k, kick.joint] = 1j * kick.size
-    found = sort_kicks(C * np.exp(off))
-    assert found.base == (0,)
-    assert [found.kicks[k].size for k in range(1, 11)] == pytest.approx([k.size for k in kicks])
+    sorted_kicks = sort_kicks(C * np.exp(off))
+    assert sorted_kicks.base == (0,)
+    assert [sorted_kicks.kicks[k].size for k in range(1, 11)] == pytest.approx(
+        [k.size for k in kicks]
+    )

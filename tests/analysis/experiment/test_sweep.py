@@ -43,9 +43,9 @@ def covered(rng, estimate):
     inside = []
     for _ in range(120):
         truth = random_matrix(rng, 4)
-        found = estimate(truth)
-        off = found.value - truth
-        inside.append(np.abs([off.real, off.imag]) <= found.half)
+        matrix = estimate(truth)
+        off = matrix.value - truth
+        inside.append(np.abs([off.real, off.imag]) <= matrix.half)
     return np.mean(inside)
 
 
@@ -76,13 +76,13 @@ def test_the_error_of_a_lag_sweep_is_the_known_one():
     rng = np.random.default_rng(9)
     m, A, sigma, N = 5, 0.02, 0.001, 500
     H, C = np.eye(m) + 0.1 * random_matrix(rng, m), dft(m, A)
-    found = [transfer(C, noisy_phasors(rng, H @ C, sigma)) for _ in range(60)]
+    matrices = [transfer(C, noisy_phasors(rng, H @ C, sigma)) for _ in range(60)]
     expected = 2 * sigma / (A * np.sqrt(N * m))
-    scatter = np.sqrt(np.mean([np.abs(one.value - H) ** 2 for one in found]))
+    scatter = np.sqrt(np.mean([np.abs(matrix.value - H) ** 2 for matrix in matrices]))
     assert scatter == pytest.approx(expected, rel=0.05)
-    stated = np.sqrt(2 * np.mean([one.error**2 for one in found]))
+    stated = np.sqrt(2 * np.mean([matrix.error**2 for matrix in matrices]))
     assert stated == pytest.approx(expected, rel=0.05)
-    assert found[0].condition_number == pytest.approx(1.0)
+    assert matrices[0].condition_number == pytest.approx(1.0)
 
 
 def test_more_runs_than_joints_are_all_used():
@@ -132,8 +132,8 @@ def test_both_routes_find_the_same_impedance():
     command = np.array([servo_torque(servo, omega, 1.0, 0.0) for servo in servos])
     angle = np.array([servo_torque(servo, omega, 0.0, 1.0) for servo in servos])
     Y = np.linalg.solve(Z - np.diag(angle), command[:, None] * C)
-    known = np.full(Y.shape, 1e-16), np.full(Y.shape, 24.0)
-    sharp, torque = Phasors(Y, *known), Phasors(Z @ Y, *known)
+    noise = np.full(Y.shape, 1e-16), np.full(Y.shape, 24.0)
+    sharp, torque = Phasors(Y, *noise), Phasors(Z @ Y, *noise)
     by_servo = impedance_behind_servos(transfer(C, sharp), *servo_side(servos, omega))
     np.testing.assert_allclose(impedance(sharp, torque).value, Z, atol=1e-10)
     np.testing.assert_allclose(by_servo.value, Z, atol=1e-10)

@@ -242,13 +242,13 @@ def test_a_multisine_in_contact_reports_what_is_mixed(tmp_path, opened):
     assert any(warning.startswith("not linear") for warning in result.warnings)
     # A record holds two periods of the grid: line k of 0.1 Hz is bin 2 k of its transform.
     lines = np.arange(1, 28)  # to the highest tone and twice the gait's beyond it
-    found = np.isin(lines, [5, 11, 17])
+    excited = np.isin(lines, [5, 11, 17])
     beside = at_tones = 0.0
     for path in paths:
         signals = opened(path).joints("/joint_states")
         values = np.stack([signals.signal(name).values for name in NAMES])
         power = np.sum(np.abs(np.fft.rfft(values, axis=1)[:, 2 * lines]) ** 2, axis=0)
-        beside, at_tones = beside + power[~found].sum(), at_tones + power[found].sum()
+        beside, at_tones = beside + power[~excited].sum(), at_tones + power[excited].sum()
     assert coupling.sideband_energy.value == pytest.approx(beside / at_tones, rel=0.05)
     low, high = coupling.sideband_energy.ci95
     assert 0 < low < beside / at_tones < high

@@ -125,8 +125,8 @@ def test_a_short_chain(tmp_path):
     """Five joints, three of them yaw joints, at 2 Hz."""
     robot = world(tmp_path, 5, 2.0)
     words = ("--settle", 1, "--measure", 2)
-    found = measured(tmp_path, "lag-sweep", *words, kernels=Kernels.NUMPY)
-    check(found, robot, h=5e-3, z=0.02, seconds=2)
+    report = measured(tmp_path, "lag-sweep", *words, kernels=Kernels.NUMPY)
+    check(report, robot, h=5e-3, z=0.02, seconds=2)
 
 
 @pytest.fixture(scope="module")
@@ -153,10 +153,10 @@ def test_both_plans_agree(long_chain):
     multisine is half as large: with all joints in phase, near the bending mode, it curls the chain
     out of its linear range.
     """
-    one, other = (coupling["tones"][0] for coupling in long_chain[1:])
-    assert one["frequency_hz"] == pytest.approx(other["frequency_hz"])
-    apart = value(one["H"]) - value(other["H"])
-    error = np.hypot(one["H"]["standard_error"], other["H"]["standard_error"])
+    tone, other = (coupling["tones"][0] for coupling in long_chain[1:])
+    assert tone["frequency_hz"] == pytest.approx(other["frequency_hz"])
+    apart = value(tone["H"]) - value(other["H"])
+    error = np.hypot(tone["H"]["standard_error"], other["H"]["standard_error"])
     scores = np.array([apart.real, apart.imag]) / error
     # 98 parts that are independent of each other: so many lie inside by chance, and so far off.
     assert binom.cdf(np.count_nonzero(np.abs(scores) <= norm.ppf(0.975)), scores.size, 0.95) > 1e-3

@@ -22,15 +22,15 @@ NAMES = tuple("abcdefg")
 TURNED = (np.array([0.0, 0.0, 0.0, np.pi, np.pi, np.pi]),) * 2
 
 
-def runs(rng, *, tilt=0.0, module=0.0, turned=False, scatter=0.002, each=6):
+def runs(rng, *, tilt=0.0, module=0.0, turned=False, scatter=0.002, count=6):
     """Runs either way, head to tail; of turned ones half of each way lie the other way round.
 
     The floor pulls the other way where the robot is turned; a reversed wave is the mirror image.
     """
-    sign = np.ones(each)
+    sign = np.ones(count)
     if turned:
-        sign[each // 2 :] = -1
-    z = rng.normal(0.0, scatter, (2, 2, each, M))
+        sign[count // 2 :] = -1
+    z = rng.normal(0.0, scatter, (2, 2, count, M))
     forward = BOUNDARY + tilt * sign[:, None] * FALL + module
     reverse = (BOUNDARY - tilt * sign[:, None] * FALL)[:, ::-1] + module
     return forward + z[0, 0] + 1j * z[0, 1], reverse + z[1, 0] + 1j * z[1, 1]
@@ -85,8 +85,8 @@ def test_many_labellings_of_strata_are_drawn_at_random():
 
 def test_turned_runs_cancel_a_tilt_that_one_heading_leaves():
     rng = np.random.default_rng(3)
-    one = mirror_test(*runs(rng, tilt=1.0, scatter=1e-6))
-    np.testing.assert_allclose(one.difference, 2 * FALL, atol=1e-5)
+    test = mirror_test(*runs(rng, tilt=1.0, scatter=1e-6))
+    np.testing.assert_allclose(test.difference, 2 * FALL, atol=1e-5)
     strata = reversal.heading_strata(*TURNED)
     both = mirror_test(*runs(rng, tilt=1.0, turned=True, scatter=1e-6), strata)
     assert np.abs(both.difference).max() < 1e-5
@@ -105,11 +105,11 @@ def test_a_tilt_names_no_module_in_either_plan():
         )
     assert named / 300 < 0.065
     for _ in range(60):
-        one = runs(rng, tilt=1.0)
-        test = mirror_test(*one)
+        both_ways = runs(rng, tilt=1.0)
+        test = mirror_test(*both_ways)
         pairs = reversal.ordered_pairs(NAMES, test)
         stated += bool(pairs)
-        single += bool(pairs) and reversal.tilt_check(*one, test).excluded
+        single += bool(pairs) and reversal.tilt_check(*both_ways, test).excluded
         assert test.p == pytest.approx(2 / 924)
     assert single == 0
     assert stated > 0  # a pair may be stated; never without the tilt
@@ -162,10 +162,10 @@ def test_the_ratio_of_common_to_contrast():
 
 
 def test_without_a_contrast_nothing_is_infinite():
-    found = reversal.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
-    assert (found.middle, found.tilt.middle) == ("d", None)
-    assert not found.tilt.excluded
-    json.dumps(dataclasses.asdict(found), allow_nan=False)
+    result = reversal.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
+    assert (result.middle, result.tilt.middle) == ("d", None)
+    assert not result.tilt.excluded
+    json.dumps(dataclasses.asdict(result), allow_nan=False)
 
 
 def test_strata_from_headings():
@@ -189,10 +189,10 @@ def test_recorded_gravity_takes_the_sensors_offset_out_where_headings_differ():
         lean = 0.01 * np.cos(heading) + 0.03 + rng.normal(0.0, 0.002, 12)
         low, high = reversal.floor_lean(lean, heading).ci95
         held["both"] += low <= 0.01 <= high
-        one = reversal.floor_lean(lean[::2], np.full(6, np.nan))
-        held["one"] += one.ci95[0] <= 0.04 <= one.ci95[1]
+        estimate = reversal.floor_lean(lean[::2], np.full(6, np.nan))
+        held["one"] += estimate.ci95[0] <= 0.04 <= estimate.ci95[1]
     t = stats.t.ppf(0.975, 5) * lean[::2].std(ddof=1) / 6**0.5
-    assert one.ci95[1] - one.ci95[0] == pytest.approx(2 * t, rel=1e-9)
+    assert estimate.ci95[1] - estimate.ci95[0] == pytest.approx(2 * t, rel=1e-9)
     assert all(0.91 <= count / 200 <= 0.99 for count in held.values())
     assert reversal.floor_lean(np.array([0.1, np.nan, 0.1]), np.zeros(3)).value is None
 

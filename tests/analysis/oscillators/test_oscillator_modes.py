@@ -48,16 +48,16 @@ def signed(rng, m, size=0.2):
 def test_a_path_has_the_gap_of_its_closed_form(n):
     K = 0.17
     P = np.eye(n) - K * path_laplacian(n)
-    found = laplacian.spectrum(P)
+    modes = laplacian.spectrum(P)
     expected = 4.0 * K * np.sin(np.arange(1, n) * math.pi / (2 * n)) ** 2
-    np.testing.assert_allclose(found.rates, expected, atol=1e-12)
-    assert found.gap == pytest.approx(4.0 * K * math.sin(math.pi / (2 * n)) ** 2)
-    assert found.strong == np.count_nonzero(expected > 0.1)
-    np.testing.assert_allclose(found.sensitivity, 1.0)  # symmetric
+    np.testing.assert_allclose(modes.rates, expected, atol=1e-12)
+    assert modes.gap == pytest.approx(4.0 * K * math.sin(math.pi / (2 * n)) ** 2)
+    assert modes.strong == np.count_nonzero(expected > 0.1)
+    np.testing.assert_allclose(modes.sensitivity, 1.0)  # symmetric
     slowest = np.cos((np.arange(n) + 0.5) * math.pi / n)
-    assert abs(found.patterns[:, 0] @ slowest) / np.linalg.norm(slowest) == pytest.approx(1.0)
+    assert abs(modes.patterns[:, 0] @ slowest) / np.linalg.norm(slowest) == pytest.approx(1.0)
     # Nothing grows, not even for a while: a symmetric chain's fastest growth is minus its gap.
-    assert laplacian.growth(P) == pytest.approx(-found.gap)
+    assert laplacian.growth(P) == pytest.approx(-modes.gap)
 
 
 @pytest.mark.parametrize("n", [5, 13])
@@ -73,24 +73,24 @@ def test_a_one_way_chain_is_not_normal_and_says_so():
     L = np.diag(np.r_[0.0, np.ones(n - 1)]) - np.diag(np.ones(n - 1), -1)
     slightly = K * L @ np.diag(1.0 + 0.05 * np.arange(n))  # else its eigenvalues are all the same
     slightly -= np.diag(slightly.sum(axis=1))
-    found = laplacian.spectrum(np.eye(n) - slightly)
-    assert found.sensitivity.max() > 100.0
+    modes = laplacian.spectrum(np.eye(n) - slightly)
+    assert modes.sensitivity.max() > 100.0
     # sigma_min is never above the distance to the nearest eigenvalue, and far below it here.
-    z = complex(np.median(found.rates.real), 0.2)
+    z = complex(np.median(modes.rates.real), 0.2)
     level = laplacian.smallest_singular(
         np.eye(n) - slightly, np.array([z.real]), np.array([z.imag])
     )[0, 0]
-    assert level < 0.2 * np.abs(found.rates - z).min()
+    assert level < 0.2 * np.abs(modes.rates - z).min()
 
 
 def test_levels_of_a_normal_matrix_are_distances():
     P = np.eye(5) - path_laplacian(5) * 0.3
-    found = laplacian.pseudospectrum(noisy(P, 1e-3))
+    levels = laplacian.pseudospectrum(noisy(P, 1e-3))
     values = np.linalg.eigvalsh(np.eye(5) - P)[1:]  # all phases together are left out
-    z = np.array(found.real)[:, None] + 1j * np.array(found.imag)
-    np.testing.assert_allclose(found.level, np.abs(z[..., None] - values).min(axis=-1), atol=1e-12)
+    z = np.array(levels.real)[:, None] + 1j * np.array(levels.imag)
+    np.testing.assert_allclose(levels.level, np.abs(z[..., None] - values).min(axis=-1), atol=1e-12)
     # The norm of a 4 x 4 matrix of noise: about 2 sqrt(4) sigma at most.
-    assert 2.0e-3 < found.noise < 6.0e-3
+    assert 2.0e-3 < levels.noise < 6.0e-3
 
 
 @pytest.mark.nightly
@@ -102,9 +102,9 @@ def test_intervals_of_rates_hold_the_truth():
     held = []
     for _ in range(60):
         table = noisy(P, 0.01, rng)
-        found = laplacian.spectrum(table.value)
+        modes = laplacian.spectrum(table.value)
         shown = laplacian.intervals_of(table.value, table.value + noise_draws(table, 21))
-        order = [int(np.argmin(np.abs(found.rates - rate))) for rate in truth.rates]
+        order = [int(np.argmin(np.abs(modes.rates - rate))) for rate in truth.rates]
         for rate, k in zip(truth.rates, order, strict=True):
             held.append(shown.real[k, 0] <= rate.real <= shown.real[k, 1])
             if abs(rate.imag) > 0.1:  # of a real eigenvalue the imaginary part is exactly zero
@@ -156,9 +156,9 @@ def test_entrainment_is_read_from_settled_phases():
     slope = Gamma * np.cos(base - rest)
     ahead = K * np.cos(rest[None, :] - rest[:, None] - 0.3)
     L = np.diag(ahead.sum(axis=1)) - ahead
-    found = entrainment(noisy(P, 1e-3))
-    np.testing.assert_allclose(found.value, L / slope[:, None], atol=3e-6)
-    assert found.condition_number == pytest.approx(np.linalg.cond(P))
+    entrained = entrainment(noisy(P, 1e-3))
+    np.testing.assert_allclose(entrained.value, L / slope[:, None], atol=3e-6)
+    assert entrained.condition_number == pytest.approx(np.linalg.cond(P))
     # A chain twice as fast in everything has the same P: rates are not to be had from it.
     again = np.linalg.solve(np.diag(2 * slope) + 2 * L, np.diag(2 * slope))
     np.testing.assert_allclose(again, P, atol=1e-6)
@@ -170,15 +170,15 @@ def test_intervals_of_the_entrainment_hold_the_truth():
     truth = np.linalg.inv(P) - np.eye(5)
     held = []
     for _ in range(60):
-        found = entrainment(noisy(P, 0.01, rng))
-        held.append(np.abs(np.array(found.value) - truth) <= found.ci95_half)
+        entrained = entrainment(noisy(P, 0.01, rng))
+        held.append(np.abs(np.array(entrained.value) - truth) <= entrained.ci95_half)
     assert 0.92 < np.mean(held) < 0.985
 
 
 def test_a_singular_matrix_is_not_inverted():
-    found = entrainment(noisy(np.full((4, 4), 0.25), 1e-3))
-    assert found.value is None
-    assert found.condition_number is None or found.condition_number > 1e6
+    entrained = entrainment(noisy(np.full((4, 4), 0.25), 1e-3))
+    assert entrained.value is None
+    assert entrained.condition_number is None or entrained.condition_number > 1e6
 
 
 def test_feedback_of_a_linear_body_relaxes_as_predicted():
@@ -205,7 +205,7 @@ def test_feedback_of_a_linear_body_relaxes_as_predicted():
     options = {"t_eval": t, "rtol": 1e-9, "atol": 1e-11}
     with_kick, without = (solve_ivp(rate, (0, 40), x, **options).y.T for x in (kick, 0 * kick))
     J = eps * relaxation(P, R, felt)
-    predicted = np.array([expm(J * one) @ kick for one in t])
+    predicted = np.array([expm(J * moment) @ kick for moment in t])
     error = np.linalg.norm(with_kick - without - predicted, axis=1) / np.linalg.norm(kick)
     assert error.max() < 0.06
     assert np.linalg.norm(predicted[-1] - kick) > 0.2 * np.linalg.norm(kick)

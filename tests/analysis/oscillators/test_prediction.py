@@ -46,15 +46,15 @@ def exact(P, R, gain=1.0, lag=0.0):
 @pytest.mark.parametrize("m", [4, 7])
 def test_a_path_relaxes_at_its_closed_form(m):
     K = 0.2
-    found = closed_loop(exact(np.eye(m) - K * path_laplacian(m), np.zeros((m, m))), EPS)
+    predicted = closed_loop(exact(np.eye(m) - K * path_laplacian(m), np.zeros((m, m))), EPS)
     rates = 4 * EPS * K * np.sin(np.arange(1, m) * math.pi / (2 * m)) ** 2
-    np.testing.assert_allclose([one.rate.value for one in found.modes], rates, atol=1e-9)
-    for mode, rate in zip(found.modes, rates, strict=True):
+    np.testing.assert_allclose([mode.rate.value for mode in predicted.modes], rates, atol=1e-9)
+    for mode, rate in zip(predicted.modes, rates, strict=True):
         assert mode.rate.ci95 == pytest.approx((rate, rate))
     slowest = np.cos((np.arange(m) + 0.5) * math.pi / m)
-    pattern = np.array(found.modes[0].pattern_abs)
+    pattern = np.array(predicted.modes[0].pattern_abs)
     np.testing.assert_allclose(pattern, np.abs(slowest) / np.linalg.norm(slowest), atol=1e-9)
-    assert f"of {m - 1} patterns of the phases {m - 1} relax" in found.answer
+    assert f"of {m - 1} patterns of the phases {m - 1} relax" in predicted.answer
 
 
 def test_gain_lag_and_age_enter_as_the_equation_has_them():
@@ -63,11 +63,11 @@ def test_gain_lag_and_age_enter_as_the_equation_has_them():
     R = random.normal(size=(4, 4))
     R -= R.mean(axis=1, keepdims=True)
     g, lag, age = 0.8, 0.3, 0.02
-    found = closed_loop(exact(P, R, g, lag), EPS, age_s=age)
+    predicted = closed_loop(exact(P, R, g, lag), EPS, age_s=age)
     turn = -lag - 2 * math.pi * 0.5 * age
     J = EPS * (g * math.cos(turn) * (P - np.eye(4)) + g * math.sin(turn) * R)
-    np.testing.assert_allclose(found.J, J, atol=1e-12)
-    np.testing.assert_allclose(found.bias, g * math.sin(turn))
+    np.testing.assert_allclose(predicted.J, J, atol=1e-12)
+    np.testing.assert_allclose(predicted.bias, g * math.sin(turn))
 
 
 def test_integrated_oscillators_do_what_is_predicted():
@@ -76,15 +76,17 @@ def test_integrated_oscillators_do_what_is_predicted():
     A, phase = np.abs(c), np.angle(c)
     kick = {"j2": 0.03, "j4": -0.02}
     off = np.array([kick.get(name, 0.0) for name in coupling.joints])
-    found = closed_loop(coupling, EPS, kick=kick, until_s=20.0)
-    bias = np.array(found.bias)
+    predicted = closed_loop(coupling, EPS, kick=kick, until_s=20.0)
+    bias = np.array(predicted.bias)
 
     def rate(_, d):
         c_now = A * np.exp(1j * (phase + d))
         return EPS * (((H @ c_now) / c_now).imag - bias)
 
-    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=found.relaxation.times_s, rtol=1e-9, atol=1e-12)
-    error = np.linalg.norm(np.array(found.relaxation.phase_rad) - done.y.T, axis=1)
+    done = solve_ivp(
+        rate, (0.0, 20.0), off, t_eval=predicted.relaxation.times_s, rtol=1e-9, atol=1e-12
+    )
+    error = np.linalg.norm(np.array(predicted.relaxation.phase_rad) - done.y.T, axis=1)
     assert np.linalg.norm(done.y.T[-1] - off) > 0.3 * np.linalg.norm(off)
     assert error.max() < 0.03 * np.linalg.norm(off)  # second order in a kick of 0.03 rad
 
@@ -119,9 +121,9 @@ def test_what_is_left_of_a_kick_has_an_interval():
     inside = []
     for _ in range(20):
         coupling = measured(random, 0.03)[2]
-        found = closed_loop(coupling, EPS, kick={"j3": 0.1}, until_s=15.0).relaxation
-        truth = np.array([expm(J * t) @ off for t in found.times_s])
-        low, high = np.array(found.low_rad), np.array(found.high_rad)
+        relaxation = closed_loop(coupling, EPS, kick={"j3": 0.1}, until_s=15.0).relaxation
+        truth = np.array([expm(J * t) @ off for t in relaxation.times_s])
+        low, high = np.array(relaxation.low_rad), np.array(relaxation.high_rad)
         inside.append(np.mean(((low <= truth) & (truth <= high))[1:]))
         assert (high[-1] - low[-1]).max() < 0.05
     assert np.mean(inside) >= 0.91
@@ -130,13 +132,13 @@ def test_what_is_left_of_a_kick_has_an_interval():
 @pytest.mark.nightly
 def test_the_limits_are_stated():
     coupling = measured()[2]
-    known = dataclasses.replace(coupling, valid_to=0.1)
+    limited = dataclasses.replace(coupling, valid_to=0.1)
     for given, eps, kick, limit in (
         (coupling, EPS, None, "isn't known"),
-        (known, EPS, {"j1": 0.2}, "beyond 0.1 rad"),
-        (known, EPS, None, "holds for deviations up to 0.1 rad"),
-        (known, 20.0, None, "take a smaller eps"),
-        (dataclasses.replace(known, checks_pass=False), EPS, None, "the prediction is doubtful"),
+        (limited, EPS, {"j1": 0.2}, "beyond 0.1 rad"),
+        (limited, EPS, None, "holds for deviations up to 0.1 rad"),
+        (limited, 20.0, None, "take a smaller eps"),
+        (dataclasses.replace(limited, checks_pass=False), EPS, None, "the prediction is doubtful"),
     ):
         assert limit in closed_loop(given, eps, kick=kick).limits[0]
 
@@ -163,9 +165,11 @@ def result(tmp_path_factory):
 @pytest.mark.nightly
 def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, report_of):
     file, sessions = result
-    found, direct = (report_of("predict", *one, "--eps", "0.3")["J"] for one in ([file], sessions))
-    np.testing.assert_allclose(found, direct, atol=1e-12)
-    np.testing.assert_allclose(found, rates_of(CHAIN, WAVE), atol=0.02)
+    by_result, direct = (
+        report_of("predict", *inputs, "--eps", "0.3")["J"] for inputs in ([file], sessions)
+    )
+    np.testing.assert_allclose(by_result, direct, atol=1e-12)
+    np.testing.assert_allclose(by_result, rates_of(CHAIN, WAVE), atol=0.02)
     output = tmp_path / "predicted.json"
     words = ("predict", file, "--eps", "0.3", "--kick", "j2=0.05", "-o", output)
     text = command(*words).out

@@ -70,20 +70,20 @@ def test_newtons_step_is_that_of_the_planted_matrix():
 
 
 def test_steps_from_what_was_measured_converge():
-    found, after = [spreads(H @ WANTED / WANTED)], ()
+    history, after = [spreads(H @ WANTED / WANTED)], ()
     for _ in range(3):
         plan, commands = compensation(EXACT, BASE, None, after, keep=0.0)
         run, spread = answered(commands)
         turned = replace(run, command=run.command * np.exp(2j))  # a run starts at any time
         after = (turned, turned)
-        found.append(spread)
-    assert plan.now.gain_cv.value == pytest.approx(found[2][0], abs=1e-6)
+        history.append(spread)
+    assert plan.now.gain_cv.value == pytest.approx(history[2][0], abs=1e-6)
     first, second, third = (
-        np.linalg.norm(found[k + 1]) / np.linalg.norm(found[k]) for k in range(3)
+        np.linalg.norm(history[k + 1]) / np.linalg.norm(history[k]) for k in range(3)
     )
     assert first < 0.1
     assert max(second, third) < 0.1
-    assert np.linalg.norm(found[-1]) < 1e-4
+    assert np.linalg.norm(history[-1]) < 1e-4
     assert np.abs(H @ commands).mean() == pytest.approx(plan.target_gain * 0.4, rel=1e-3)
 
 
@@ -100,11 +100,11 @@ def test_a_joint_at_its_limit_is_named_and_the_others_make_up_for_it():
     joints = list(robot.joints)
     joints[yaw[worst]] = replace(joints[yaw[worst]], upper=limit / (1 - RESERVE))
     plan, commands = compensation(local, base, replace(robot, joints=tuple(joints)), keep=0.0)
-    one = plan.joints[worst]
+    joint = plan.joints[worst]
     assert abs(commands[worst]) == pytest.approx(limit, rel=1e-6)
-    assert (one.limited_by, one.margin) == ("position", pytest.approx(RESERVE))
-    assert one.lacking == pytest.approx(math.log(needs[worst] / limit), abs=1e-3)
-    assert [other.name for other in plan.joints if other.lacking > 0] == [one.name]
+    assert (joint.limited_by, joint.margin) == ("position", pytest.approx(RESERVE))
+    assert joint.lacking == pytest.approx(math.log(needs[worst] / limit), abs=1e-3)
+    assert [other.name for other in plan.joints if other.lacking > 0] == [joint.name]
     again, held = compensation(
         local, base, replace(robot, joints=tuple(joints)), (driven(commands, local),), keep=0.0
     )
@@ -178,15 +178,15 @@ def test_by_the_commands_of_the_manual(tmp_path, command, report_of):
     kicks = tmp_path / "kicks.json"
     command("analyse", *paths, "-o", kicks)
     words = ("plan", "compensate", kicks, "--like", paths[0])
-    found = []
+    reports = []
     for k in range(2):
         more = ("--after", tmp_path / f"driven{k - 1}.mcap") if k else ()
-        found.append(report_of(*words, *more, "-o", tmp_path / f"next{k}"))
-        asked = commanded(found[-1]["files"][0])
+        reports.append(report_of(*words, *more, "-o", tmp_path / f"next{k}"))
+        asked = commanded(reports[-1]["files"][0])
         linear_chain.write_run(
             tmp_path / f"driven{k}.mcap", asked, linear_chain.CHAIN @ asked, 90 + k, 0.002
         )
-    first, second = found
+    first, second = reports
     assert (first["plan"], first["settle_s"]) == ("compensate", 10.0)
     assert first["now"] == first["kicked"] == second["kicked"]
     for name in ("gain_cv", "lag_sd"):

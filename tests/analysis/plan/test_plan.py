@@ -50,8 +50,8 @@ def test_kicks_read_back_as_kicks(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
     files = report_of("plan", "phase-kicks", *words)["files"]
     assert len(files) == 4 * 4 + 6 + 3
-    found = [phasors(file, 3.0) for file in files]
-    command = np.stack([one[0][0, YAW] for one in found])
+    measured = [phasors(file, 3.0) for file in files]
+    command = np.stack([run[0][0, YAW] for run in measured])
     runs = sort_kicks(command)
     assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (6, 16, 3)
     for kind in KickKind:
@@ -59,13 +59,13 @@ def test_kicks_read_back_as_kicks(like, tmp_path, report_of):
     np.testing.assert_allclose(np.abs(command[runs.base[0]]), 0.3, rtol=1e-5)
     for k, kick in runs.kicks.items():
         assert abs(abs(kick.size) - 0.05) < 1e-5
-        plan = found[k][2]
+        plan = measured[k][2]
         assert (plan["plan"], plan["kind"]) == ("phase-kicks", kick.kind.value)
         assert plan["joint"] == ROBOT.joint_names[YAW[kick.joint]]
         assert float(plan["sign"]) * kick.size > 0
         assert plan["run"] == str(k)
-    assert len({one[2]["plan_id"] for one in found}) == 1
-    for _, offset, _ in found:
+    assert len({run[2]["plan_id"] for run in measured}) == 1
+    for _, offset, _ in measured:
         np.testing.assert_allclose(offset, np.linspace(-0.1, 0.1, 25), atol=1e-5)
 
 
@@ -94,19 +94,19 @@ def test_a_reversal_alternates(like, tmp_path, report_of):
     assert [file.rpartition("-")[2] for file in files] == [f"{h}.mcap" for h in (0, 180, 180, 0)]
 
 
-@pytest.mark.parametrize("each", [2, 6, 8])
-def test_half_of_each_direction_is_turned_and_drift_cancels(each):
-    runs = reversal(BASE, each)
+@pytest.mark.parametrize("count", [2, 6, 8])
+def test_half_of_each_direction_is_turned_and_drift_cancels(count):
+    runs = reversal(BASE, count)
     way = np.array([1 if run.facts["kind"] == "as-recorded" else -1 for run in runs])
     turn = np.array([1 if run.label.endswith("-0") else -1 for run in runs])
     place = np.arange(len(runs)) - (len(runs) - 1) / 2
-    assert [(way == 1).sum(), (turn == 1).sum()] == [each, each]
+    assert [(way == 1).sum(), (turn == 1).sum()] == [count, count]
     # Each way at each heading as often: the three contrasts are orthogonal.
     assert way @ turn == 0
-    if each % 4 == 0:  # pairs of blocks: a drift that is linear in time is in no contrast
+    if count % 4 == 0:  # pairs of blocks: a drift that is linear in time is in no contrast
         assert place @ way == place @ turn == 0
     # The robot is turned every second run at most.
-    assert (np.diff(turn) != 0).sum() <= each
+    assert (np.diff(turn) != 0).sum() <= count
 
 
 def test_what_is_refused(like, tmp_path, command):
@@ -144,14 +144,14 @@ def test_a_lag_sweep_is_a_dft(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "s", "--amplitude", 0.03)
     plan = report_of("plan", "lag-sweep", *words)
     assert len(plan["files"]) == 4
-    found = [phasors(file, plan["settle_s"], 10.0, 0.8) for file in plan["files"]]
-    C = np.stack([one[0][0, YAW] for one in found], axis=1)
+    runs = [phasors(file, plan["settle_s"], 10.0, 0.8) for file in plan["files"]]
+    C = np.stack([run[0][0, YAW] for run in runs], axis=1)
     np.testing.assert_allclose(np.abs(C), 0.03, rtol=1e-6)
     assert np.linalg.cond(C) == pytest.approx(1.0, abs=1e-6)
-    for one, _, plan in found:
-        step = one[0, YAW][1:] / one[0, YAW][:-1]
+    for values, _, plan in runs:
+        step = values[0, YAW][1:] / values[0, YAW][:-1]
         np.testing.assert_allclose(step, np.exp(1j * float(plan["lag_rad"])), atol=1e-5)
-    assert sorted(plan["run"] for _, _, plan in found) == ["0", "1", "2", "3"]
+    assert sorted(plan["run"] for _, _, plan in runs) == ["0", "1", "2", "3"]
 
 
 def test_settling_follows_from_the_slowest_body_mode(like, tmp_path, report_of):
@@ -167,11 +167,11 @@ def test_every_tone_of_a_multisine_is_a_dft(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "m", "--measure", 12)
     plan = report_of("plan", "multisine", *words)
     omega = tones(2 * np.pi * 0.8, 3)
-    found = [phasors(file, plan["settle_s"], 12.5, omega / (2 * np.pi)) for file in plan["files"]]
+    runs = [phasors(file, plan["settle_s"], 12.5, omega / (2 * np.pi)) for file in plan["files"]]
     assert omega[0] == 2 * np.pi * 0.8
-    assert found[0][2]["measure_s"] == "12.5"  # two whole periods
+    assert runs[0][2]["measure_s"] == "12.5"  # two whole periods
     for tone in range(3):
-        C = np.stack([one[0][tone, YAW] for one in found], axis=1)
+        C = np.stack([run[0][tone, YAW] for run in runs], axis=1)
         np.testing.assert_allclose(np.abs(C), 0.02 * (omega[0] / omega[tone]) ** 2, rtol=1e-6)
         assert np.linalg.cond(C) == pytest.approx(1.0, abs=1e-6)
 
@@ -180,9 +180,9 @@ def test_every_tone_of_a_multisine_is_a_dft(like, tmp_path, report_of):
 def test_no_tone_is_another_plus_gait_frequencies(count):
     gait = 2 * np.pi * 0.7
     chosen = tones(gait, count)
-    for i, one in enumerate(chosen):
+    for i, tone in enumerate(chosen):
         for sign in (1, -1):
-            apart = (chosen - sign * one) / gait
+            apart = (chosen - sign * tone) / gait
             off = np.abs(apart - np.round(apart))
             off[i] = 1.0
             assert off.min() > 0.5 / (2 * count - 1)

@@ -64,11 +64,11 @@ def test_only_the_excited_lines_are_commanded(inputs, like, tmp_path, report_of)
         assert np.abs(first[:, places] - offset[places]).max() <= float(record["peak_rad"]) + 1e-4
         matrices.setdefault(record["realisation"], []).append(spectrum[lines])
     assert len(matrices) == 2
-    one, other = (np.stack(matrix) for matrix in matrices.values())
-    assert np.abs(one - other).max() > 0.01  # other phases
+    chosen, other = (np.stack(matrix) for matrix in matrices.values())
+    assert np.abs(chosen - other).max() > 0.01  # other phases
     if inputs == "orthogonal":
-        for each in (one, other):
-            assert np.linalg.cond(np.moveaxis(each, 1, 0)).max() == pytest.approx(1.0, abs=1e-6)
+        for matrix in (chosen, other):
+            assert np.linalg.cond(np.moveaxis(matrix, 1, 0)).max() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_one_odd_line_of_each_group_is_left_out_whatever_the_seed():

@@ -98,8 +98,8 @@ def test_groups_have_windows_of_their_own(tmp_path):
     gait = dataclasses.replace(gait, groups=groups, windows=windows)
     write_csv([dataclasses.replace(snake, gait=gait, joints=joints)], tmp_path / "x.csv")
     table = pd.read_csv(tmp_path / "x.csv")
-    found = table[["start_s", "stop_s", "cycles"]].drop_duplicates()
-    assert found.to_numpy().tolist() == [[1.0, 5.0, 3.0]]
+    spans = table[["start_s", "stop_s", "cycles"]].drop_duplicates()
+    assert spans.to_numpy().tolist() == [[1.0, 5.0, 3.0]]
 
 
 def test_what_is_refused(runs, tmp_path, command):

@@ -16,8 +16,8 @@ def places(value, path=()):
     yield path
     inside = value.items() if isinstance(value, dict) else ()
     inside = enumerate(value[:2]) if isinstance(value, list) else inside
-    for key, one in inside:
-        yield from places(one, (*path, key))
+    for key, inner in inside:
+        yield from places(inner, (*path, key))
 
 
 @pytest.fixture(scope="module")
@@ -33,21 +33,21 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("other", OTHERS, ids=repr)
 def test_whatever_stands_there_it_is_a_result_or_a_sentence(other, whole, tmp_path):
     path, refused = tmp_path / "x.json", 0
-    found = [place for place in places(whole) if place]
-    for place in found[:: max(1, len(found) // 15)]:
+    paths = [place for place in places(whole) if place]
+    for place in paths[:: max(1, len(paths) // 15)]:
         data = json.loads(json.dumps(whole))
         node = data
         for key in place[:-1]:
             node = node[key]
         node[place[-1]] = other
         path.write_text(json.dumps(data))
-        said = ""
+        sentence = ""
         try:
             load(path)
         except DataError as error:
-            said = str(error)
-        assert not said or str(path) in said, place
-        refused += bool(said)
+            sentence = str(error)
+        assert not sentence or str(path) in sentence, place
+        refused += bool(sentence)
     assert refused > 5
 
 

@@ -117,12 +117,12 @@ def test_identifiers_are_unique_and_every_anchor_lands(page):
     root = tree(page)
     ids = [n.attributes["id"] for n in root.all() if "id" in n.attributes]
     assert len(ids) == len(set(ids))
-    wanted = [n.attributes["href"] for n in root.all("a")]
+    targets = [n.attributes["href"] for n in root.all("a")]
     for node in root.all("section", "article", "svg"):
         label = node.attributes.get("aria-labelledby")
-        wanted += [f"#{label}"] if label else []
+        targets += [f"#{label}"] if label else []
         assert label or node.attributes.get("aria-label") or "aria-hidden" in node.attributes
-    assert all(target[1:] in ids for target in wanted)
+    assert all(target[1:] in ids for target in targets)
 
 
 def test_svgs_have_titles_tables_have_captions_headings_have_order(page):
@@ -191,9 +191,9 @@ def test_numbers_of_the_joints_are_those_of_the_analysis(snake, snake_page):
             ("command [°]", Estimate(joint.command_amplitude_rad), 180 / math.pi),
             ("coverage [%]", Estimate(joint.coverage), 100.0),
         ):
-            known = [] if quantity.value is None else [quantity.value, *(quantity.ci95 or ())]
-            assert numbers(cell[name]) == pytest.approx([v * scale for v in known], rel=1e-12)
-            if not known:
+            values = [] if quantity.value is None else [quantity.value, *(quantity.ci95 or ())]
+            assert numbers(cell[name]) == pytest.approx([v * scale for v in values], rel=1e-12)
+            if not values:
                 assert "–" in cell[name].text()
             for shown in cell[name].all("data"):  # what is read is what is stored, rounded
                 read, stored = shown.text().replace("−", "-"), float(shown.attributes["value"])

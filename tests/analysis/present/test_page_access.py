@@ -33,7 +33,7 @@ def nodes(browser):
     """Nodes of the tree that are not ignored: role, name, properties."""
     browser.call("Accessibility.enable")
     try:
-        found = browser.call("Accessibility.getFullAXTree")["nodes"]
+        reply = browser.call("Accessibility.getFullAXTree")["nodes"]
     finally:
         browser.call("Accessibility.disable")
     return [
@@ -42,7 +42,7 @@ def nodes(browser):
             node.get("name", {}).get("value", "").strip(),
             {p["name"]: p["value"].get("value") for p in node.get("properties", [])},
         )
-        for node in found
+        for node in reply
         if not node["ignored"]
     ]
 
@@ -51,23 +51,23 @@ def nodes(browser):
 def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
     browser.open(address)
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
-    found = nodes(browser)
+    tree = nodes(browser)
     named = {"image", "button", "link", "region", "navigation", "group", "heading", "article"}
-    roles = Counter(role for role, *_ in found)
+    roles = Counter(role for role, *_ in tree)
     nameless = [
         (role, properties)
-        for role, name, properties in found
+        for role, name, properties in tree
         if not name and (role in named - {"group"} or properties.get("focusable") is True)
     ]
     # The document and what scrolls have names, too; text to copy is its own name.
-    assert [one for one in nameless if one[0] not in ("RootWebArea", "code", "generic")] == []
+    assert [node for node in nameless if node[0] not in ("RootWebArea", "code", "generic")] == []
     assert roles["main"] == roles["contentinfo"] == roles["navigation"] == 1
-    regions = [name for role, name, _ in found if role == "region"]
+    regions = [name for role, name, _ in tree if role == "region"]
     assert [regions.index(part) for part in ("Question", "Answer")] == [0, 1]
     assert [region for region in regions if region in ("Evidence", "Limits", "Method")] == [
         *("Evidence", "Limits", "Method")
     ]
-    levels = [properties["level"] for role, _, properties in found if role == "heading"]
+    levels = [properties["level"] for role, _, properties in tree if role == "heading"]
     assert levels[0] == 1
     assert all(after <= before + 1 for before, after in pairwise(levels))
     assert roles["columnheader"] >= roles["table"] > 0
@@ -77,8 +77,8 @@ def test_everything_that_is_reached_has_a_name_and_a_place(browser, address):
 @pytest.mark.nightly
 def test_figures_have_name_and_description(browser, address):
     browser.open(address)
-    found = nodes(browser)
-    images = [name for role, name, _ in found if role == "image"]
+    tree = nodes(browser)
+    images = [name for role, name, _ in tree if role == "image"]
     drawn = browser.evaluate("document.querySelectorAll('svg.figure, svg.map').length")
     assert len(images) >= drawn
     assert all(len(name.split()) > 1 for name in images)

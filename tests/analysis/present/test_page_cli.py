@@ -44,10 +44,10 @@ def test_several_sessions_are_one_experiment(both_ways_files, tmp_path, command,
     order = "j2 answers less than its mirror j4 (p = 0.002)"
     assert first.startswith(f"12 sessions: the modules differ: {order}")
     assert second.startswith(f"{page}: ")
-    found = page.read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
-    assert f"The modules differ: {order}" in found
+    text = page.read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+    assert f"The modules differ: {order}" in text
     result = report_of("report", *files, "-o", page, "--force")
-    assert (result["answer"], [one["path"] for one in result["answers"]]) == (first, files)
+    assert (result["answer"], [answer["path"] for answer in result["answers"]]) == (first, files)
 
 
 def test_an_existing_page_stays_without_force(recorded, tmp_path, command):

@@ -19,7 +19,7 @@ SCHEMES = [
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "expected"),
+    ("first", "other", "expected"),
     [  # G. Sharma, W. Wu, E. N. Dalal, Color Research and Application 30 (2005), Table 1.
         ((50, 2.6772, -79.7751), (50, 0, -82.7485), 2.0425),
         ((50, 2.5, 0), (73, 25, -18), 27.1492),
@@ -27,8 +27,8 @@ SCHEMES = [
         ((2.0776, 0.0795, -1.1350), (0.9033, -0.0636, -0.5514), 0.9082),
     ],
 )
-def test_the_difference_is_ciede2000(one, other, expected):
-    assert difference(one, other) == pytest.approx(expected, abs=1e-4)
+def test_the_difference_is_ciede2000(first, other, expected):
+    assert difference(first, other) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)

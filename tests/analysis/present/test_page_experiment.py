@@ -81,7 +81,7 @@ def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
         phase_row.total.value for phase_row in coupling.phase_rows
     ]
     held = rows(pages["kicked"], "heldout")
-    assert [row[2][0] for row in held] == [100 * one.error for one in coupling.held_out]
+    assert [row[2][0] for row in held] == [100 * pattern.error for pattern in coupling.held_out]
 
 
 def test_a_sweep_is_shown_tone_by_tone(pages, swept):
@@ -183,14 +183,14 @@ def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
     where = ("/joint_states", "position")
     gaps = [Artefact(joint.name, *where, "gaps", ((9.0, 9.5),)) for joint in snake.joints]
     frozen = Artefact("joint07", *where, "frozen", ((10.0, 12.0),), "stuck")
-    known = dataclasses.replace(snake, artefacts=(*gaps, frozen))
-    first, second = artefact_rows(known)
+    flagged = dataclasses.replace(snake, artefacts=(*gaps, frozen))
+    first, second = artefact_rows(flagged)
     assert (first.joints, first.flag, first.times) == ("joint07", "frozen", "10.00 to 12.00 s")
     assert first.meaning.endswith("commanded to move; stuck")
     assert (second.joints, second.about) == ("all 25 joints", "the record, not mechanics")
     # Ten of sixteen seconds into the session, two long.
     assert 'd="M62.50 0h12.50v10h-12.50z"' in str(first.line)
-    assert render(known).count("10.00 to 12.00 s") == 1
+    assert render(flagged).count("10.00 to 12.00 s") == 1
 
 
 def test_the_travel_of_perturbed_gaits_is_drawn_and_every_number_is_in_the_table(both_ways):

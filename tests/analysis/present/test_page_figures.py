@@ -104,8 +104,8 @@ def test_a_drag_zooms_and_the_new_ticks_are_true(page, snake):
 def positions(svg):
     """Every coordinate of a figure, without the ring around the value."""
     shapes = re.sub(r'<rect class="ring".*?</rect>', "", svg)
-    found = re.findall(r' (?:d|x|y)="([^"]*)"', shapes)
-    return [float(v) for one in found for v in re.findall(r"-?\d+\.?\d*", one)]
+    coordinates = re.findall(r' (?:d|x|y)="([^"]*)"', shapes)
+    return [float(v) for text in coordinates for v in re.findall(r"-?\d+\.?\d*", text)]
 
 
 def test_keys_walk_along_the_samples_and_zoom(page, snake):

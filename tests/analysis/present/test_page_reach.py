@@ -52,12 +52,12 @@ def test_numbers_stand_out_from_their_cells(browser, address, dark):
 
 def test_the_tab_key_reaches_every_row_and_shows_its_intervals(browser, address):
     browser.open(address)
-    found = "(e => e.getAttribute('aria-label') || e.textContent)(document.activeElement)"
+    script = "(e => e.getAttribute('aria-label') || e.textContent)(document.activeElement)"
     seen = "[...document.querySelectorAll('.half')].map(t => getComputedStyle(t).visibility)"
     reached = []
     while len(reached) < 60 and not (reached and reached[-1].startswith("j2 follows")):
         browser.press("Tab")
-        reached.append(browser.evaluate(found))
+        reached.append(browser.evaluate(script))
     assert reached[0] == "Skip to the answer"
     assert reached[-2].startswith("j1 follows: j1 ")
     assert "\N{PLUS-MINUS SIGN}" in reached[-1]

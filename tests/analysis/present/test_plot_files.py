@@ -16,7 +16,7 @@ from undulog.analysis.present.svg import CSS_VARIABLES, drawing, inline_svg, kep
 from undulog.capture.common.errors import OutputExistsError
 
 NAMES = ("j1", "j2", "j3")
-SENTINELS = [tuple(round(255 * c) for c in colors.to_rgb(each)) for each in CSS_VARIABLES]
+SENTINELS = [tuple(round(255 * c) for c in colors.to_rgb(colour)) for colour in CSS_VARIABLES]
 
 
 @pytest.fixture
@@ -57,8 +57,14 @@ def test_each_figure_of_the_page_is_a_file(kind, run, tmp_path, command):
         if kind == "svg":
             root = ET.parse(path).getroot()
             assert root.tag == "{http://www.w3.org/2000/svg}svg"
-            texts = ["".join(each.itertext()) for each in root.iter() if each.tag.endswith("text")]
-            page_texts = ["".join(each.itertext()) for each in ET.fromstring(svg).iter("text")]
+            texts = [
+                "".join(element.itertext())
+                for element in root.iter()
+                if element.tag.endswith("text")
+            ]
+            page_texts = [
+                "".join(element.itertext()) for element in ET.fromstring(svg).iter("text")
+            ]
             assert texts == page_texts
         else:
             assert_no_placeholders(path)
@@ -83,7 +89,7 @@ def test_each_page_has_a_folder_of_its_own(run, tmp_path, command):
 
 @pytest.mark.slow
 def test_colours_of_the_page_become_those_of_paper(tmp_path):
-    sentinel = next(each for each, name in CSS_VARIABLES.items() if name == "var(--reference)")
+    sentinel = next(colour for colour, name in CSS_VARIABLES.items() if name == "var(--reference)")
     with kept_figures() as drawn, drawing(2.0, 2.0) as figure:
         axes = figure.subplots()
         axes.axhspan(0.0, 1.0, color=sentinel)
@@ -122,7 +128,7 @@ def test_a_matrix_has_the_colours_of_its_cells(count, small, tmp_path):
     scale = image.shape[1] / width
     assert image.shape[0] == pytest.approx(scale * height, abs=2)
     paper = paper_colors()
-    cells = [each for each in root.iter("rect") if each.get("class", "").split()[0] in paper]
+    cells = [rect for rect in root.iter("rect") if rect.get("class", "").split()[0] in paper]
     assert len(cells) > count * count  # and the colour bar
     for cell in cells[: count * count - 1]:
         kind = cell.get("class").split()[0]

@@ -44,12 +44,12 @@ def results(request):
         "local coupling": ("kicked", "coupling"),
         "coupling": ("snake", "coupling"),
     }
-    found = {}
+    by_name = {}
     for name in NAMES:
         fixture, part = parts.get(name, (name.replace(" ", "_"), None))
         whole = request.getfixturevalue(fixture)
-        found[name] = whole if part is None else getattr(whole, part)
-    return found
+        by_name[name] = whole if part is None else getattr(whole, part)
+    return by_name
 
 
 NAMES = ("snake", "still", "single", "hostile", "both ways", "kicked", "reversal")
@@ -147,8 +147,8 @@ def test_a_coupling_is_one_row_a_pair(kicked):
         ("hostile", ["segments"]),
         ("comparison", ["differences", "waveforms"]),
         *(
-            pytest.param(*each, marks=pytest.mark.nightly)
-            for each in (
+            pytest.param(*case, marks=pytest.mark.nightly)
+            for case in (
                 ("snake", ["segments", "body"]),
                 ("single", ["segments"]),
                 ("both ways", ["mirror"]),
@@ -175,7 +175,7 @@ def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path
 
 def test_two_figures_on_one_page_share_no_identifier(snake):
     first, second = (snake.plot()._repr_html_() for _ in range(2))
-    ids = [{part.split('"')[0] for part in one.split(' id="')[1:]} for one in (first, second)]
+    ids = [{part.split('"')[0] for part in figure.split(' id="')[1:]} for figure in (first, second)]
     assert ids[0]
     assert ids[0].isdisjoint(ids[1])
 

@@ -43,11 +43,11 @@ class Planted:
 
 
 def autoregression(rng, correlation, shape):
-    found = rng.standard_normal(shape)
+    noise = rng.standard_normal(shape)
     for k in range(1, shape[-1]):
-        found[..., k] *= (1 - correlation**2) ** 0.5
-        found[..., k] += correlation * found[..., k - 1]
-    return found
+        noise[..., k] *= (1 - correlation**2) ** 0.5
+        noise[..., k] += correlation * noise[..., k - 1]
+    return noise
 
 
 def planted_session(rng, planted, cycles, joints=JOINTS):
@@ -66,8 +66,8 @@ def planted_session(rng, planted, cycles, joints=JOINTS):
         parts = rng.standard_normal((2, 2)) @ [1, 1j]
         change = planted.settling * parts[0] * np.exp(-(place - place[0]) / planted.tau)
         change = change + planted.drift * parts[1] * place / cycles
-        each = autoregression(rng, planted.correlation, (2, cycles + 1))
-        change = change + planted.sd * (each[0] + 1j * each[1])[(place - place[0]).astype(int)]
+        noise = autoregression(rng, planted.correlation, (2, cycles + 1))
+        change = change + planted.sd * (noise[0] + 1j * noise[1])[(place - place[0]).astype(int)]
         wave = gain * (1 + change) * size * np.exp(1j * late)
         name = f"j{i}"
         commands[name] = Series(name, t, size * np.cos(angle))
@@ -80,8 +80,8 @@ def planted_session(rng, planted, cycles, joints=JOINTS):
 def oracle(planted, cycles, columns):
     """Half width of least squares that know the trend and the correlation, but not the scale."""
     place = np.arange(cycles)
-    own = 2 * (NOISE_RAD / AMPLITUDE_RAD / 0.95) ** 2 / (RATE_HZ / GAIT_HZ) * np.eye(cycles)
-    covariance = own + planted.sd**2 * planted.correlation ** np.abs(place[:, None] - place)
+    measured = 2 * (NOISE_RAD / AMPLITUDE_RAD / 0.95) ** 2 / (RATE_HZ / GAIT_HZ) * np.eye(cycles)
+    covariance = measured + planted.sd**2 * planted.correlation ** np.abs(place[:, None] - place)
     design = columns(place.astype(float))
     factor = t_factor(2 * (cycles - design.shape[1]))
     return factor * np.linalg.inv(design.T @ np.linalg.solve(covariance, design))[0, 0] ** 0.5
@@ -128,8 +128,8 @@ def outcome(planted, cycles, draws, seed=1, joints=JOINTS):
             gain, lag = gain_estimate(gait.response, k), lag_estimate(gait.response, k)
             inside.append(
                 [
-                    one.ci95[0] <= value <= one.ci95[1]
-                    for one, value in zip((gain, lag), truth[name], strict=True)
+                    estimate.ci95[0] <= value <= estimate.ci95[1]
+                    for estimate, value in zip((gain, lag), truth[name], strict=True)
                 ]
             )
             widths.append([np.log(gain.ci95[1] / gain.ci95[0]) / 2, np.ptp(lag.ci95) / 2])
@@ -140,13 +140,13 @@ def outcome(planted, cycles, draws, seed=1, joints=JOINTS):
 @pytest.mark.parametrize("case", CASES)
 def test_intervals_contain_what_a_gait_settles_at(case):
     planted, columns = CASES[case]
-    found = outcome(planted, 24, 25)
-    assert 0.87 <= found.gain <= 1.0, found
-    assert 0.87 <= found.lag <= 1.0, found
-    assert found.width <= 1.5 * oracle(planted, 24, columns), found
+    result = outcome(planted, 24, 25)
+    assert 0.87 <= result.gain <= 1.0, result
+    assert 0.87 <= result.lag <= 1.0, result
+    assert result.width <= 1.5 * oracle(planted, 24, columns), result
     expected = {"settling": Trend.SETTLING, "drift": Trend.DRIFTING}.get(case, Trend.STEADY)
     if case != "frequency":  # a delay is another lag at another frequency
-        assert found.trends[expected] >= 23, found
+        assert result.trends[expected] >= 23, result
 
 
 @pytest.mark.nightly
@@ -155,20 +155,20 @@ def test_intervals_contain_what_a_gait_settles_at(case):
 )
 def test_intervals_hold_in_19_of_20_repetitions(case, cycles):
     planted, columns = CASES[case]
-    found = outcome(planted, cycles, REPETITIONS, seed=7)
-    assert 0.91 <= found.gain <= 0.98, found
-    assert 0.91 <= found.lag <= 0.98, found
-    assert found.width <= 1.2 * oracle(planted, cycles, columns), found
+    result = outcome(planted, cycles, REPETITIONS, seed=7)
+    assert 0.91 <= result.gain <= 0.98, result
+    assert 0.91 <= result.lag <= 0.98, result
+    assert result.width <= 1.2 * oracle(planted, cycles, columns), result
     if case == "none":
-        assert found.trends[Trend.STEADY] >= 0.95 * REPETITIONS, found
+        assert result.trends[Trend.STEADY] >= 0.95 * REPETITIONS, result
 
 
 @pytest.mark.nightly
 def test_variation_of_one_joint():
     """One joint shows its correlation poorly: the interval holds, but is wider."""
-    found = outcome(CASES["variation"][0], 24, REPETITIONS, seed=7, joints=1)
-    assert 0.91 <= found.gain <= 0.98, found
-    assert 0.91 <= found.lag <= 0.98, found
+    result = outcome(CASES["variation"][0], 24, REPETITIONS, seed=7, joints=1)
+    assert 0.91 <= result.gain <= 0.98, result
+    assert 0.91 <= result.lag <= 0.98, result
 
 
 @pytest.mark.nightly
@@ -177,13 +177,13 @@ def test_variation_of_one_joint():
 def test_short_sessions_hold(case, joints):
     """Eight cycles, from the transient on."""
     planted, _ = CASES[case]
-    found = outcome(
+    result = outcome(
         planted if case != "settling" else Planted(settling=0.1, tau=1.5), 8, 200, 3, joints
     )
-    assert found.gain >= 0.91, found
-    assert found.lag >= 0.91, found
+    assert result.gain >= 0.91, result
+    assert result.lag >= 0.91, result
     if case == "none":
-        assert found.trends[Trend.STEADY] >= 190, found
+        assert result.trends[Trend.STEADY] >= 190, result
 
 
 def test_the_size_of_a_drift_and_the_time_of_settling():
@@ -252,8 +252,8 @@ def test_variation_that_joints_share_counts_once():
         scatter = 0.01 * np.broadcast_to(common, (2, 8, 24)).reshape(16, 24)
         series = 1 + scatter + rng.normal(0, 0.002, (16, 24))
         noise = CycleNoise(np.full(16, 0.002**2), 0.02, np.ones(24))
-        found = slow_changes(series, np.arange(24.0), noise)
-        inside.append(np.abs(found.level.value - 1) <= found.level.half)
+        changes = slow_changes(series, np.arange(24.0), noise)
+        inside.append(np.abs(changes.level.value - 1) <= changes.level.half)
     assert np.mean(inside) >= 0.88
 
 
@@ -282,7 +282,7 @@ def test_exact_signals_and_few_cycles_have_no_trend():
     gait = fit_gait(exact, late, 6.0, notes.append)
     assert gait.response.gain[0] == pytest.approx(0.9, abs=1e-9)
     assert not any("settled" in text for text in notes)
-    four = {name: one.between(0.0, 4.0) for name, one in late.items()}
+    four = {name: series.between(0.0, 4.0) for name, series in late.items()}
     gait = fit_gait({"q": exact["q"].between(0.0, 4.0)}, four, 4.0, notes.append)
     assert gait.changes is None
 

@@ -30,8 +30,8 @@ def test_a_short_session_gives_what_a_long_one_settles_at(name, tmp_path):
         for joint in short.joints:
             if joint.name not in truth:
                 continue
-            for found, value in zip((joint.gain, joint.lag_rad), truth[joint.name], strict=True):
-                low, high = found.ci95
+            for estimate, value in zip((joint.gain, joint.lag_rad), truth[joint.name], strict=True):
+                low, high = estimate.ci95
                 inside.append(low - LEFT <= value <= high + LEFT)
         assert len(inside) > 20
         assert np.mean(inside) >= 0.91, (start_s, cycles)

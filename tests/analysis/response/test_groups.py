@@ -29,7 +29,7 @@ def test_lags_at_the_bound_and_intervals_that_hold_in_each_group(ratio, bend):
     # 320 lags a group or more: standard errors 4 % of the ratio, 1.2 % of each coverage.
     for rmse, *covered in group_tables.figures(Snake(ratio, bend=bend), 2e-3, 40):
         assert rmse < 1.1
-        assert all(0.915 <= one <= 0.985 for one in covered)
+        assert all(0.915 <= share <= 0.985 for share in covered)
 
 
 @pytest.mark.parametrize("ratio", [1.5, 1.432 / 0.954, GOLDEN, 2.0])
@@ -40,8 +40,8 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
         (tuple(snake.names[k::2]) for k in (0, 1)), key=lambda names: gait.group_of(names[0])
     )
     for group in gait.groups:
-        own = snake.omega[snake.names.index(group.driven[0]) % 2]
-        assert (group.fit.omega, group.answered) == (pytest.approx(own, rel=1e-9), group.driven)
+        rate = snake.omega[snake.names.index(group.driven[0]) % 2]
+        assert (group.fit.omega, group.answered) == (pytest.approx(rate, rel=1e-9), group.driven)
     # A dense least-squares fit of everything, at the true frequencies, is the reference.
     t = snake.t + snake.skew_s
     rows = [np.ones_like(t)]
@@ -52,14 +52,14 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
                 seen.append(order * omega)
                 rows += [np.cos(order * omega * t), -np.sin(order * omega * t)]
     theta = np.linalg.lstsq(np.stack(rows).T, snake.response.T, rcond=None)[0]
-    found = snake.estimates(gait)[:, 0]
+    estimates = snake.estimates(gait)[:, 0]
     for j in range(snake.joints):
         b = seen.index(snake.omega[snake.group[j]])
         a = complex(theta[1 + 2 * b, j], theta[2 + 2 * b, j])
-        own = snake.omega[snake.group[j]]
-        c = 2 * np.mean(snake.command[j] * np.exp(-1j * own * snake.t))
-        assert found[0, j] == pytest.approx(-np.angle(a / c), abs=0.03)  # c by a plain sum
-        assert found[1, j] == pytest.approx(abs(a / c), rel=0.05)
+        rate = snake.omega[snake.group[j]]
+        c = 2 * np.mean(snake.command[j] * np.exp(-1j * rate * snake.t))
+        assert estimates[0, j] == pytest.approx(-np.angle(a / c), abs=0.03)  # c by a plain sum
+        assert estimates[1, j] == pytest.approx(abs(a / c), rel=0.05)
 
 
 def test_one_frequency_is_one_group_with_the_numbers_of_the_plain_fit():

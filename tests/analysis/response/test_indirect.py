@@ -25,7 +25,7 @@ def loop(rng, reference, noise_sd):
     closed = [1.0, CONTROL * SIZE - POLE]  # times u: C (1 - POLE / z) (r - v / z)
     u = signal.lfilter(CONTROL * np.array([1.0, -POLE]), closed, reference - late)
     y = signal.lfilter([SIZE], [1.0, -POLE], u) + v
-    return [Series("q", T_S, one) for one in (reference, u, y)]
+    return [Series("q", T_S, samples) for samples in (reference, u, y)]
 
 
 def noisy(rng):
@@ -85,14 +85,14 @@ def test_tones_of_a_reference():
 
 def test_the_method_is_named_and_a_reference_that_is_still_is_none():
     r, u, y = noisy(np.random.default_rng(6))
-    (one,) = frequency_responses({"q": u}, {"q": y}, print, {"q": r})
-    assert one.method == "indirect"
-    agree, lines = one.halves_agree
+    (response,) = frequency_responses({"q": u}, {"q": y}, print, {"q": r})
+    assert response.method == "indirect"
+    agree, lines = response.halves_agree
     assert agree >= 0.85 * lines
     still = Series("q", T_S, np.zeros(COUNT))
     for references in (None, {}, {"p": r}, {"q": still}):
-        (one,) = frequency_responses({"q": u}, {"q": y}, print, references)
-        assert one.method == "direct"
+        (response,) = frequency_responses({"q": u}, {"q": y}, print, references)
+        assert response.method == "direct"
 
 
 def test_lines_at_which_the_reference_does_not_move_the_command_are_left_out():

@@ -42,8 +42,8 @@ def test_intervals_hold_the_chosen_responses():
         command, response = record(rng)
         tones = tones_of(command)
         assert tones == pytest.approx(TONES, abs=1e-6)
-        found = tone_response(command, response, tones)
-        inside.append(np.abs(found.value - RESPONSE) <= found.radius())
+        at_tones = tone_response(command, response, tones)
+        inside.append(np.abs(at_tones.value - RESPONSE) <= at_tones.radius())
     assert 0.92 <= np.mean(inside) <= 0.98
 
 

@@ -22,8 +22,8 @@ def write(path, *, moving=True):
 
 def test_worst_first_and_each_once():
     remarks = Remarks()
-    for one in ("late", Note("no topic"), Lacking("no gait"), "late", Note("no topic")):
-        remarks(one)
+    for remark in ("late", Note("no topic"), Lacking("no gait"), "late", Note("no topic")):
+        remarks(remark)
     assert remarks.warnings(["cut short"]) == ("no gait", "cut short", "late")
     assert remarks.notes == ("no topic",)
     assert json.dumps([*remarks.warnings(), *remarks.notes]) == '["no gait", "late", "no topic"]'
@@ -31,12 +31,12 @@ def test_worst_first_and_each_once():
 
 
 def test_topics_that_were_not_recorded_are_no_warnings(tmp_path, opened):
-    found = analyse_session(opened(write(tmp_path / "s.mcap")))
-    assert found.warnings == ()
+    analysis = analyse_session(opened(write(tmp_path / "s.mcap")))
+    assert analysis.warnings == ()
     for lacking in ("effort and velocity", "/joint_current and no /joint_voltage", "/gait"):
-        assert any(lacking in note for note in found.notes), lacking
-    shown = found.to_dict()
-    assert (shown["warnings"], shown["notes"]) == ([], list(found.notes))
+        assert any(lacking in note for note in analysis.notes), lacking
+    shown = analysis.to_dict()
+    assert (shown["warnings"], shown["notes"]) == ([], list(analysis.notes))
 
 
 @pytest.mark.slow
@@ -57,6 +57,6 @@ def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, command):
 
 
 def test_that_there_is_no_gait_comes_first(tmp_path, opened):
-    found = analyse_session(opened(write(tmp_path / "s.mcap", moving=False)))
-    assert found.warnings[0].startswith("no gait: the commands never move")
-    assert any(note.startswith("no joint's gain and lag are known") for note in found.notes)
+    analysis = analyse_session(opened(write(tmp_path / "s.mcap", moving=False)))
+    assert analysis.warnings[0].startswith("no gait: the commands never move")
+    assert any(note.startswith("no joint's gain and lag are known") for note in analysis.notes)

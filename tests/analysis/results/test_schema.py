@@ -30,8 +30,8 @@ def closed(schema):
 
 
 def faults(name, result):
-    found = Draft202012Validator(closed(published(name))).iter_errors(result)
-    return [f"{one.json_path}: {one.message[:200]}" for one in found]
+    errors = Draft202012Validator(closed(published(name))).iter_errors(result)
+    return [f"{error.json_path}: {error.message[:200]}" for error in errors]
 
 
 @pytest.mark.parametrize("name", RESULTS)

@@ -50,9 +50,9 @@ def test_the_external_reference_gives_the_indirect_method(tmp_path, command):
     drawn = rng.normal(0, 0.2, 3000), rng.normal(0, 0.05, 3000)
     path = write_loop(tmp_path / "loop.mcap", 3000, *drawn, ["steer.offset"])
     result = analysed(path, Options(excitation_topic="/reference"))
-    (found,) = result.frequency_response
-    assert found.method == "indirect"
-    low, high = np.array(found.gain_ci95).T
+    (response,) = result.frequency_response
+    assert response.method == "indirect"
+    low, high = np.array(response.gain_ci95).T
     assert np.mean((low <= LOOP_GAIN) & (high >= LOOP_GAIN)) > 0.85
     assert not [text for text in result.warnings if "biases a frequency response" in text]
     assert result.closed_loop == "an adaptive controller (steering)"

@@ -9,10 +9,10 @@ from support.ros_bags import GAIN, LAG, NAMES, commanded, filling, write_bag
 def bag(tmp_path_factory):
     """No robot, no torque; the commands at 50 Hz, the states at 100 Hz, nothing undulog wrote."""
 
-    def write(own, t_ns, t_s):
+    def write(log, t_ns, t_s):
         if round(100 * t_s) % 2 == 0:
-            own.state(t_ns, t_s, "/snake/targets", commanded(t_s))
-        own.state(t_ns, t_s, "/snake/encoders")
+            log.state(t_ns, t_s, "/snake/targets", commanded(t_s))
+        log.state(t_ns, t_s, "/snake/encoders")
 
     (file,) = write_bag(tmp_path_factory.mktemp("foreign") / "bag", filling(write)).glob("*.mcap")
     return file
@@ -31,14 +31,14 @@ def test_naming_the_topics_is_enough(bag, report_of):
         assert {joint[key] for key in ("energy_net_j", "energy_el_j", "plane")} == {None}
     assert (result["over_time"], result["energy"]["electrical"]) == (None, None)
     assert (result["energy"]["closure"], result["energy"]["transport"]["abs"]) == (None, None)
-    found = " ".join(result["notes"])
+    text = " ".join(result["notes"])
     for note in (
         "/snake/encoders carries no effort and velocity: mechanical energies are null",
         "no /joint_current and no /joint_voltage: electrical energies are null",
         "cost of transport is not applicable: ",
         "gain and lag over time are null: the session has no /gait",
     ):
-        assert note in found
+        assert note in text
     assert f"{topics[0]} {topics[1]}" in result["provenance"]["command"]
 
 

@@ -40,18 +40,18 @@ def slither(tmp_path_factory):
 def test_every_joint_is_compared_at_its_own_frequency(slither):
     result = analysed(slither)
     assert [len(group.joints) for group in result.gait.groups] == [8, 8]
-    found = {group.joints[0]: group for group in result.gait.groups}
+    groups = {group.joints[0]: group for group in result.gait.groups}
     for joint, frequency in (("joint01", 1.432), ("joint02", 0.954)):
-        group = found[joint]
+        group = groups[joint]
         assert group.frequency_hz.value == pytest.approx(frequency, rel=1e-9)
         (window,) = group.windows
         assert (window.cycles, group.wave) == (np.floor(15.0 * frequency), "head-to-tail")
         assert group.lag_per_joint_rad == {"chain": pytest.approx(-1.6)}
     assert result.gait.frequency_hz == result.gait.groups[0].frequency_hz
     for joint in result.joints:
-        own = result.gait.groups[joint.group]
-        assert joint.name in own.joints
-        assert joint.frequency_hz == own.frequency_hz.value
+        joint_group = result.gait.groups[joint.group]
+        assert joint.name in joint_group.joints
+        assert joint.frequency_hz == joint_group.frequency_hz.value
         # Its own command and, at its frequency, its group's other joints through the body.
         assert joint.gain.value == pytest.approx(0.95, abs=0.05)
         assert joint.lag_rad.value == pytest.approx(0.2, abs=0.05)
@@ -110,7 +110,7 @@ def test_the_reversal_takes_all_groups_together(tmp_path):
     assert [joint.name for joint in result.reversal.joints][:4] == [
         f"joint0{k}" for k in range(1, 5)
     ]
-    assert min(result.reversal.joints, key=lambda one: one.p).name in ("joint03", "joint07")
+    assert min(result.reversal.joints, key=lambda joint: joint.p).name in ("joint03", "joint07")
 
 
 @pytest.mark.nightly

@@ -34,14 +34,14 @@ def fill_horizons(bag):
     fill_trajectory(bag, count=20, stamped=False)
 
 
-def dynamic(own, *tick):
-    own.dynamic(*tick)
-    own.trajectory(*tick)
+def dynamic(log, *tick):
+    log.dynamic(*tick)
+    log.trajectory(*tick)
 
 
-def array(own, *tick):
-    own.state(*tick)
-    own.array(*tick)
+def array(log, *tick):
+    log.state(*tick)
+    log.array(*tick)
 
 
 def check(result):
@@ -65,10 +65,10 @@ def test_the_response_comes_out_of_each_type(kind, storage, tmp_path, report_of)
     fill, command, response = KINDS[kind]
     result = report_of("analyse", write_bag(tmp_path / "bag", fill, storage=storage))
     check(result)
-    (found,) = [note for note in result["notes"] if "found by type" in note]
-    assert command in found
-    assert response in found
-    assert "--command-topic and --response-topic" in found
+    (by_type,) = [note for note in result["notes"] if "found by type" in note]
+    assert command in by_type
+    assert response in by_type
+    assert "--command-topic and --response-topic" in by_type
 
 
 @pytest.mark.parametrize("version", ["foxy", "galactic", "humble", "iron", "jazzy"])
@@ -76,7 +76,7 @@ def test_the_response_comes_out_of_each_type(kind, storage, tmp_path, report_of)
 def test_every_release_of_the_controller_state(version, storage, tmp_path, report_of):
     old = version in ("foxy", "galactic", "humble")
     how = ("/arm/state", ("desired", "actual")) if old else ()
-    fill = filling(lambda own, *tick: own.controller(*tick, *how))
+    fill = filling(lambda log, *tick: log.controller(*tick, *how))
     path = write_bag(tmp_path / "bag", fill, storage=storage, store=typestore(version))
     check(report_of("analyse", path))
 
@@ -99,16 +99,16 @@ def test_the_joints_of_an_array_are_those_of_the_states_or_of_the_option(
 
 
 def test_a_controller_is_named_as_a_whole_or_by_its_part(tmp_path, report_of, command):
-    def write(own, *tick):
-        own.controller(*tick)
-        own.controller(*tick, "/leg/controller_state")
-        own.state(*tick, "/other/encoders")
+    def write(log, *tick):
+        log.controller(*tick)
+        log.controller(*tick, "/leg/controller_state")
+        log.state(*tick, "/other/encoders")
 
     bag = write_bag(tmp_path / "bag", filling(write))
     result = report_of("analyse", bag)
     check(result)
-    (found,) = [note for note in result["notes"] if "found by type" in note]
-    assert "/leg/controller_state.reference" in found.partition("; other joints: ")[2]
+    (by_type,) = [note for note in result["notes"] if "found by type" in note]
+    assert "/leg/controller_state.reference" in by_type.partition("; other joints: ")[2]
     whole = ["--command-topic", "/leg/controller_state", "--response-topic", "/other/encoders"]
     result = report_of("analyse", bag, *whole)
     check(result)

@@ -15,13 +15,13 @@ ROBOT = load_robot("snake25")
 WINDOWS = (Window(1.0, 3.0, 2.0),)
 
 
-def lying(path, *, fall=0.0, plan=None, own=None, heading=None, robot=ROBOT):
+def lying(path, *, fall=0.0, plan=None, metadata=None, heading=None, robot=ROBOT):
     """A session whose accelerometer lies on a floor that falls towards the head."""
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=robot) as writer:
         if plan is not None:
             writer.note("undulog.plan", {"plan": "reversal", **plan})
-        if own is not None:
-            writer.note("undulog", own)
+        if metadata is not None:
+            writer.note("undulog", metadata)
         if heading is not None:
             text = f"[world]\nheading = {heading}\n".encode()
             writer.attach("scenario.toml", "application/toml", text)

@@ -122,14 +122,16 @@ def test_an_adaptive_scenario_gives_sense_over_time(name, tmp_path):
         gain = np.array(joint.gain, dtype=float)
         lag = np.array(joint.lag_rad, dtype=float)
         assert gain.size >= 6
-        found = ~np.isnan(gain)  # what could not be estimated in a cycle is null, and so is its lag
-        assert found.sum() >= gain.size - 1
-        np.testing.assert_array_equal(np.isnan(lag), ~found)
-        gain, lag = gain[found], lag[found]
+        finite = ~np.isnan(
+            gain
+        )  # what could not be estimated in a cycle is null, and so is its lag
+        assert finite.sum() >= gain.size - 1
+        np.testing.assert_array_equal(np.isnan(lag), ~finite)
+        gain, lag = gain[finite], lag[finite]
         assert ((gain > 0.7) & (gain < 1.3)).all()
         assert ((lag > 0.0) & (lag < 0.7)).all()
         intervals = [ends for ends in joint.gain_ci95 if ends is not None]
-        assert all(low < one < high for one, (low, high) in zip(gain, intervals, strict=True))
+        assert all(low < value < high for value, (low, high) in zip(gain, intervals, strict=True))
     if name == "avoidance":  # it hastens, and the lag in rad grows with the frequency
         rates = np.array(driven[6].frequency_hz)
         lags = np.array(driven[6].lag_rad)

@@ -64,25 +64,25 @@ def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
 def test_polling_skew_biases_the_lag_only_where_it_is_not_logged(bag, wave):
     truth = wave(np.random.default_rng(3))
     still = np.zeros((truth.ticks_ns.size, 25))
-    known = write_wave(bag("known.mcap"), truth, still).analysed()
+    logged = write_wave(bag("known.mcap"), truth, still).analysed()
     unknown = write_wave(bag("unknown.mcap"), truth, still, offsets=False).analysed()
-    assert np.max(np.abs(np.degrees(lags(known) - truth.lag))) < 1e-5
+    assert np.max(np.abs(np.degrees(lags(logged) - truth.lag))) < 1e-5
     biased = np.degrees(lags(unknown) - truth.lag)
     np.testing.assert_allclose(biased, -np.degrees(truth.omega * truth.skew_s), atol=1e-5)
 
 
 def test_one_message_per_servo_is_read_right(bag, wave):
     truth = wave(np.random.default_rng(4), joints=7, duration=6.0)
-    one = bag()
+    log = bag()
     for t_ns in truth.ticks_ns:
         # Servos are polled in turn, each with a stamp of its own, every other one half as often.
         for i, name in enumerate(truth.names):
             own_ns = t_ns + i * 1_000_000
-            one.write("/joint_commands", own_ns, [name], [truth.command(own_ns)[i]])
+            log.write("/joint_commands", own_ns, [name], [truth.command(own_ns)[i]])
             if i % 2 == 0 or t_ns % 20_000_000 < 10_000_000:
                 own_ns += 300_000
-                one.write("/joint_states", own_ns, [name], [truth.response(own_ns)[i]])
-    result = one.analysed()
+                log.write("/joint_states", own_ns, [name], [truth.response(own_ns)[i]])
+    result = log.analysed()
     assert [joint.name for joint in result.joints] == truth.names
     np.testing.assert_allclose(lags(result), truth.lag, atol=1e-7)
     np.testing.assert_allclose(gains(result), truth.gain, atol=1e-7)
@@ -92,14 +92,14 @@ def test_one_message_per_servo_is_read_right(bag, wave):
 
 def test_energies_of_sinusoidal_torque_and_velocity(bag, epoch_ns):
     """Closed form: with tau = T sin(wt + p), q' = V cos(wt), net = T V sin(p) / 2 a second."""
-    one = bag()
+    log = bag()
     omega, torque, phase = 2 * np.pi * 0.8, 0.7, np.array([0.3, -0.4])
     speed = 0.4 * omega
     for tick in range(1000):
         turn = omega * tick / 100 * np.ones(2)
         q, rate, effort = 0.4 * np.sin(turn), speed * np.cos(turn), torque * np.sin(turn + phase)
-        one.write_both(epoch_ns + tick * 10**7, ["a", "b"], q, q, rate, effort)
-    result = one.analysed()
+        log.write_both(epoch_ns + tick * 10**7, ["a", "b"], q, q, rate, effort)
+    result = log.analysed()
     (window,) = result.gait.windows
     assert (window.cycles, window.stop_s - window.start_s) == (8, pytest.approx(10.0))
     net = torque * speed * np.sin(phase) / 2 * 10
@@ -114,11 +114,11 @@ def test_energies_of_sinusoidal_torque_and_velocity(bag, epoch_ns):
 
 
 def test_a_ramp_has_no_gait(bag, epoch_ns):
-    one = bag()
+    log = bag()
     for tick in range(600):
         q = np.array([0.02, -0.01]) * tick / 100
-        one.write_both(epoch_ns + tick * 10**7, ["a", "b"], q, q - 1e-3)
-    result = one.analysed()
+        log.write_both(epoch_ns + tick * 10**7, ["a", "b"], q, q - 1e-3)
+    result = log.analysed()
     assert (result.gait.frequency_hz.value, result.gait.wave) == (None, None)
     for joint in result.joints:
         assert (joint.gain.value, joint.gain.ci95, joint.lag_rad.value) == (None, None, None)
@@ -130,12 +130,12 @@ def test_a_ramp_has_no_gait(bag, epoch_ns):
 
 @pytest.mark.parametrize("value", [0.0, 0.3])
 def test_a_constant_command_has_no_gait(bag, epoch_ns, value):
-    one = bag()
+    log = bag()
     rng = np.random.default_rng(1)
     for tick in range(300):
         response = [value + rng.normal(0, 1e-3)]
-        one.write_both(epoch_ns + tick * 10**7, ["a"], [value], response)
-    result = one.analysed()
+        log.write_both(epoch_ns + tick * 10**7, ["a"], [value], response)
+    result = log.analysed()
     assert result.gait.frequency_hz.value is None
     assert any("the commands never move" in text for text in result.warnings)
 
@@ -152,7 +152,7 @@ def test_a_real_arcsnake_trajectory_has_no_gait(bag):
     log = SHARED / "arcsnake" / "linear_trajectory.candump.log"
     if not log.exists():
         pytest.skip(f"the recording {log} is not here")
-    one = bag()
+    session_log = bag()
     for line in log.read_text().splitlines():
         stamp, _, frame, way = line.split()
         data = bytes.fromhex(frame.partition("#")[2])
@@ -160,11 +160,11 @@ def test_a_real_arcsnake_trajectory_has_no_gait(bag):
         t_ns = int(seconds) * 10**9 + int(fraction) * 1000
         if data[0] == 0xA4 and way == "T":
             angle = np.radians(struct.unpack("<i", data[4:8])[0] * 0.01)
-            one.write("/joint_commands", t_ns, ["screw"], [angle])
+            session_log.write("/joint_commands", t_ns, ["screw"], [angle])
         elif data[0] == 0x92 and way == "R":
             angle = np.radians(int.from_bytes(data[1:8], "little", signed=True) * 0.01)
-            one.write("/joint_states", t_ns, ["screw"], [angle])
-    result = one.analysed()
+            session_log.write("/joint_states", t_ns, ["screw"], [angle])
+    result = session_log.analysed()
     (joint,) = result.joints
     assert (joint.gain.value, joint.lag_rad.value) == (None, None)
     assert joint.samples > 1000
@@ -174,12 +174,12 @@ def test_a_real_arcsnake_trajectory_has_no_gait(bag):
 
 def test_joints_that_are_held_have_no_gain_and_are_named_once(bag, wave):
     truth = wave(np.random.default_rng(6), joints=6, duration=8.0)
-    one = bag()
+    log = bag()
     for t_ns in truth.ticks_ns:
         command, response = truth.command(t_ns), truth.response(t_ns)
         command[1::2] = response[1::2] = 0.0
-        one.write_both(t_ns, truth.names, command, response)
-    result = one.analysed()
+        log.write_both(t_ns, truth.names, command, response)
+    result = log.analysed()
     assert [joint.gain.value is None for joint in result.joints] == [False, True] * 3
     assert all(joint.command_amplitude_rad == 0.0 for joint in result.joints[1::2])
     named = [text for text in (*result.warnings, *result.notes) if "joint02" in text]
@@ -190,17 +190,17 @@ def test_joints_that_are_held_have_no_gain_and_are_named_once(bag, wave):
 
 def test_artefacts_are_dropped_flagged_and_reported(bag, wave):
     truth = wave(np.random.default_rng(7), joints=3, duration=8.0)
-    one = bag()
+    log = bag()
     for tick, t_ns in enumerate(truth.ticks_ns):
         response = truth.response(t_ns)
         if 100 <= tick < 103:
             response[0] = np.nan
-        one.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
+        log.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
         if not 300 <= tick < 380:
-            one.write("/joint_states", t_ns, truth.names, response)
+            log.write("/joint_states", t_ns, truth.names, response)
         if tick in (20, 21):
-            one.write("/joint_states", t_ns, truth.names, response + 5.0)
-    result = one.analysed()
+            log.write("/joint_states", t_ns, truth.names, response + 5.0)
+    result = log.analysed()
     assert result.joints[0].flags == ("nan", "duplicate_stamps", "gaps")
     assert result.joints[1].flags == ("duplicate_stamps", "gaps")
     assert result.joints[1].coverage == pytest.approx(0.9, abs=0.02)
@@ -211,15 +211,15 @@ def test_artefacts_are_dropped_flagged_and_reported(bag, wave):
 def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
     rng = np.random.default_rng(11)
     truth = wave(rng, joints=12, duration=8.0)
-    one = bag()
+    log = bag()
     for tick, t_ns in enumerate(truth.ticks_ns):
         response = truth.response(t_ns) + rng.normal(0, 1e-3, 12)
         response[2] = 0.1
         response[4] = 0.2 + rng.normal(0, 1e-3)
         if 300 <= tick < 400:
             response[6] = 0.1234
-        one.write_both(t_ns, truth.names, truth.command(t_ns), response)
-    result = one.analysed()
+        log.write_both(t_ns, truth.names, truth.command(t_ns), response)
+    result = log.analysed()
     lost = [joint.name for joint in result.joints if joint.lag_rad.value is None]
     assert lost == ["joint03", "joint05", "joint07"]
     assert all(joint.gain.value is None for joint in result.joints if joint.name in lost)
@@ -241,11 +241,11 @@ def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
 
 
 def test_samples_without_effort_count_no_energy(bag, epoch_ns):
-    one = bag()
+    log = bag()
     for tick in range(1000):
         q, effort = [0.4 * np.sin(5 * tick / 100)], [2.0 if tick < 600 else np.nan]
-        one.write_both(epoch_ns + tick * 10**7, ["a"], q, q, [1.0], effort)
-    result = one.analysed()
+        log.write_both(epoch_ns + tick * 10**7, ["a"], q, q, [1.0], effort)
+    result = log.analysed()
     (window,) = result.gait.windows
     assert result.joints[0].energy_net_j == pytest.approx(2.0 * (6.0 - window.start_s), abs=0.05)
     assert result.joints[0].coverage == pytest.approx(1.0)
@@ -279,26 +279,26 @@ def test_missing_commands_and_missing_responses(bag, wave):
 
 def test_start_and_stop(bag, wave):
     truth = wave(np.random.default_rng(9), joints=2, duration=9.0)
-    one = write_wave(bag(), truth, np.zeros((truth.ticks_ns.size, 2)), offsets=False)
-    result = one.analysed(Options(start_s=2.0, stop_s=7.0))
+    log = write_wave(bag(), truth, np.zeros((truth.ticks_ns.size, 2)), offsets=False)
+    result = log.analysed(Options(start_s=2.0, stop_s=7.0))
     (window,) = result.gait.windows
     assert (window.stop_s, window.cycles) == (pytest.approx(7.0), 4)
     assert window.stop_s - window.start_s == pytest.approx(4 / 0.97)
     assert result.gait.fitted.start_s == pytest.approx(2.0)
     assert "--start 2.0 --stop 7.0" in result.provenance.command
     with pytest.raises(UsageError, match="nothing between --start and --stop"):
-        analysed(one.path, Options(start_s=20.0))
+        analysed(log.path, Options(start_s=20.0))
 
 
 def test_standing_still_at_the_ends_is_left_out(bag, wave):
     truth = wave(np.random.default_rng(10), joints=3, duration=12.0)
-    one = bag()
+    log = bag()
     last = truth.ticks_ns.size - 1
     for tick in range(last + 1):
         inside_ns = truth.ticks_ns[min(max(tick, 300), last - 200)]
         command, response = truth.command(inside_ns), truth.response(inside_ns)
-        one.write_both(truth.ticks_ns[tick], truth.names, command, response)
-    result = one.analysed()
+        log.write_both(truth.ticks_ns[tick], truth.names, command, response)
+    result = log.analysed()
     fitted = result.gait.fitted
     assert (fitted.start_s, fitted.stop_s) == pytest.approx((3.0, 10.0), abs=0.02)
     np.testing.assert_allclose(lags(result), truth.lag, atol=1e-2)
@@ -306,9 +306,9 @@ def test_standing_still_at_the_ends_is_left_out(bag, wave):
 
 def test_commands_and_responses_that_never_overlap(bag, wave):
     truth = wave(np.random.default_rng(12), joints=2)
-    one = bag()
+    log = bag()
     for t_ns in truth.ticks_ns:
-        one.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
-        one.write("/joint_states", t_ns + 60 * 10**9, truth.names, truth.response(t_ns))
+        log.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
+        log.write("/joint_states", t_ns + 60 * 10**9, truth.names, truth.response(t_ns))
     with pytest.raises(DataError, match="don't overlap in time"):
-        one.analysed()
+        log.analysed()

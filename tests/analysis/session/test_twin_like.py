@@ -170,8 +170,8 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     # 13 joints of 0.25 (A omega)^2 W each, and 25 W electrical, which the ledger books as 20 W.
     mechanical = 13 * 0.25 * (0.3 * OMEGA) ** 2
     path = write_twin(tmp_path / "booked.mcap", ledger=(mechanical, 20.0), odometry=False)
-    (found,) = [text for text in analysed(path).warnings if "ledger" in text]
-    assert found.startswith("electrical energy is 300 J from the samples but 240 J")
+    (warning,) = [text for text in analysed(path).warnings if "ledger" in text]
+    assert warning.startswith("electrical energy is 300 J from the samples but 240 J")
 
 
 def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, result):
@@ -224,9 +224,9 @@ def test_the_json_object(twin, report_of):
     assert {"id", "robot", "duration_s", "verdict"} <= set(printed["session"])
     assert {"frequency_hz", "windows"} <= set(printed["gait"])
     assert [joint["name"] for joint in printed["joints"]] == [f"joint{i:02d}" for i in range(1, 26)]
-    known = {"name", "plane", "gain", "gain_ci95", "lag_rad", "lag_ci95", "coverage", "flags"}
-    known |= {"energy_net_j", "energy_plus_j", "energy_abs_j", "energy_el_j"}
-    assert all(known <= set(joint) for joint in printed["joints"])
+    keys = {"name", "plane", "gain", "gain_ci95", "lag_rad", "lag_ci95", "coverage", "flags"}
+    keys |= {"energy_net_j", "energy_plus_j", "energy_abs_j", "energy_el_j"}
+    assert all(keys <= set(joint) for joint in printed["joints"])
     driven = printed["joints"][0]
     assert driven["gain_ci95"][0] < driven["gain"] < driven["gain_ci95"][1]
     assert driven["lag_ci95"][0] < driven["lag_rad"] < driven["lag_ci95"][1]

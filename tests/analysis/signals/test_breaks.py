@@ -18,8 +18,8 @@ HOUR = 3600 * NS
 DAY = 24 * HOUR
 
 
-def length(found: object) -> float:
-    return found.gait.fitted.stop_s - found.gait.fitted.start_s
+def length(analysis: object) -> float:
+    return analysis.gait.fitted.stop_s - analysis.gait.fitted.start_s
 
 
 @pytest.mark.parametrize("log_too", [False, True])
@@ -30,40 +30,40 @@ def test_the_longest_unbroken_stretch_gives_the_numbers(
     jumps = {1200: jump_ns}
     path = gait(tmp_path / "run.mcap", jumps=jumps, log_jumps=jumps if log_too else None)
     with Session.open(path) as session:
-        found = analyse_session(session)
+        analysis = analyse_session(session)
         assert judgement_of_session(session).faults == ()
-    assert found.gait.frequency_hz.value == pytest.approx(1.0, abs=1e-4)
-    for joint in found.joints:  # as the file was written
+    assert analysis.gait.frequency_hz.value == pytest.approx(1.0, abs=1e-4)
+    for joint in analysis.joints:  # as the file was written
         assert joint.gain.value == pytest.approx(0.9, abs=2e-3)
         assert joint.lag_rad.value == pytest.approx(0.3, abs=2e-3)
         assert joint.coverage == pytest.approx(1.0, abs=1e-2)
-    assert length(found) == pytest.approx(12.0, abs=0.05)
+    assert length(analysis) == pytest.approx(12.0, abs=0.05)
     shown = "longest unbroken stretch, 12.0 s, is analysed, 1 other stretch of 8.0 s altogether"
-    assert shown in found.answer.sentence
-    assert any(shown in text for text in found.warnings)
+    assert shown in analysis.answer.sentence
+    assert any(shown in text for text in analysis.warnings)
 
 
 def test_start_and_stop_choose_another_stretch(tmp_path: Path, opened) -> None:
     path = gait(tmp_path / "run.mcap", jumps={1200: HOUR})
-    found = analyse_session(opened(path), Options(start_s=3000.0))
-    assert length(found) == pytest.approx(8.0, abs=0.05)
-    assert found.joints[0].gain.value == pytest.approx(0.9, abs=2e-3)
-    assert not any("unbroken" in text for text in found.warnings)
-    assert "unbroken" not in found.answer.sentence
+    analysis = analyse_session(opened(path), Options(start_s=3000.0))
+    assert length(analysis) == pytest.approx(8.0, abs=0.05)
+    assert analysis.joints[0].gain.value == pytest.approx(0.9, abs=2e-3)
+    assert not any("unbroken" in text for text in analysis.warnings)
+    assert "unbroken" not in analysis.answer.sentence
 
 
 def test_a_loss_of_some_seconds_breaks_nothing(tmp_path: Path, opened) -> None:
     path = gait(tmp_path / "run.mcap", jumps={1200: 4 * NS})  # four whole cycles
-    found = analyse_session(opened(path))
-    assert "unbroken" not in found.answer.sentence
-    assert length(found) == pytest.approx(24.0, abs=0.05)
+    analysis = analyse_session(opened(path))
+    assert "unbroken" not in analysis.answer.sentence
+    assert length(analysis) == pytest.approx(24.0, abs=0.05)
 
 
 def test_every_other_sample_apart_by_years_takes_no_memory(tmp_path: Path, opened) -> None:
     """Clocks that jump to and fro leave stretches of a few samples: no gait, and no grid."""
     jumps = {tick: (9 if tick % 40 else 90 * DAY // NS) * NS for tick in range(0, 2000, 20)}
-    found = analyse_session(opened(gait(tmp_path / "run.mcap", jumps=jumps)))
-    assert found.gait.frequency_hz.value is None
+    analysis = analyse_session(opened(gait(tmp_path / "run.mcap", jumps=jumps)))
+    assert analysis.gait.frequency_hz.value is None
 
 
 def brute(times: list[np.ndarray]) -> tuple[int, int]:
@@ -82,11 +82,11 @@ def test_channels_bridge_each_others_gaps(seed: int) -> None:
     for _ in range(3):
         step = np.where(rng.random(200) < 0.05, rng.uniform(8, 40, 200), rng.uniform(0.1, 1, 200))
         times.append((np.cumsum(step) * NS).astype(np.int64))
-    found = longest_unbroken(times)
-    assert (found.start_ns, found.last_ns) == brute(times)
+    stretch = longest_unbroken(times)
+    assert (stretch.start_ns, stretch.last_ns) == brute(times)
 
 
 def test_slow_channels_are_not_broken_by_their_own_interval() -> None:
     slow = np.arange(100) * 60 * NS
-    found = longest_unbroken([slow])
-    assert (found.start_ns, found.last_ns, found.others) == (0, int(slow[-1]), 0)
+    stretch = longest_unbroken([slow])
+    assert (stretch.start_ns, stretch.last_ns, stretch.others) == (0, int(slow[-1]), 0)

@@ -42,7 +42,10 @@ def test_the_same_gait_in_other_units_and_at_another_time_has_the_same_windows()
     pace = by_time([0.5, 0.8], [30.0, 30.0])
     series, stop_s = commands(pace)
     first = several_gaits(series, 0.0, stop_s)
-    moved = [Series(each.name, each.t_s + 1000.0, -57.3 * each.values + 9.0) for each in series]
+    moved = [
+        Series(channel.name, channel.t_s + 1000.0, -57.3 * channel.values + 9.0)
+        for channel in series
+    ]
     second = several_gaits(moved, 1000.0, 1000.0 + stop_s)
     for a, b in zip(first, second, strict=True):
         assert b.start_s - 1000.0 == pytest.approx(a.start_s, abs=0.03)
@@ -109,5 +112,5 @@ def test_standing_and_too_short_commands_have_none():
 def test_a_loss_of_samples_divides_no_gait(lost_s):
     series, stop_s = commands(np.full(3000, 0.7))
     kept = (series[0].t_s < 25.0) | (series[0].t_s > 25.0 + lost_s)
-    lost = [Series(each.name, each.t_s[kept], each.values[kept]) for each in series]
+    lost = [Series(channel.name, channel.t_s[kept], channel.values[kept]) for channel in series]
     assert several_gaits(lost, 0.0, stop_s) == []

@@ -15,8 +15,8 @@ def ordered(names):
 
 def test_numbers_order_what_was_sorted_as_text():
     names = [f"joint_{k}" for k in range(1, 13)]
-    found, (note,) = ordered(sorted(names))
-    assert found == names
+    order, (note,) = ordered(sorted(names))
+    assert order == names
     assert "order of their numbers: joint_1, joint_2" in note
     two = [f"{side}_{k}" for side in ("left", "right") for k in range(12)]
     assert ordered(sorted(two))[0] == two

@@ -93,7 +93,7 @@ def test_another_frequency_half_way_is_no_soft_stop():
 def test_groups_that_start_apart():
     ramp = joints(lambda t: np.clip(t / 2, 0, 1), count=5)
     late = joints(lambda t: np.clip((t - 1) / 3, 0, 1), omega=0.6 * OMEGA, count=4)
-    late = [Series(f"v{k}", one.t_s, one.values) for k, one in enumerate(late)]
+    late = [Series(f"v{k}", channel.t_s, channel.values) for k, channel in enumerate(late)]
     start, stop = part([*ramp, *late])
     assert 3.9 <= start <= 4.8
     assert stop == pytest.approx(19.98)
@@ -106,15 +106,15 @@ def test_a_soft_start_in_a_bag_leaves_the_interval_of_a_steady_one(bag, wave):
     for ramp_s in (0.0, 5.0):
         truth = wave(np.random.default_rng(3), joints=6, duration=15.0)
         noise = np.random.default_rng(4).normal(0, 0.004, (truth.ticks_ns.size, 6))
-        one = bag(f"{ramp_s}.mcap")
+        log = bag(f"{ramp_s}.mcap")
         for tick, t_ns in enumerate(truth.ticks_ns):
             grown = 1.0 if ramp_s == 0 else min(tick / 100 / ramp_s, 1.0)
             command = 0.05 + grown * (truth.command(t_ns) - 0.05)
             response = 0.04 + grown * (truth.response(t_ns) - 0.04)
-            one.write("/joint_commands", t_ns, truth.names, command)
-            one.write("/joint_states", t_ns, truth.names, response + noise[tick])
-        one.close()
-        result = analysed(one.path)
+            log.write("/joint_commands", t_ns, truth.names, command)
+            log.write("/joint_states", t_ns, truth.names, response + noise[tick])
+        log.close()
+        result = analysed(log.path)
         (text,) = [w for w in result.warnings if "soft start" in w] or [""]
         assert bool(text) == (ramp_s > 0)
         assert result.gait.fitted.start_s == pytest.approx(ramp_s, abs=0.6)
@@ -124,4 +124,4 @@ def test_a_soft_start_in_a_bag_leaves_the_interval_of_a_steady_one(bag, wave):
         widths.append(np.median([e.ci95[1] - e.ci95[0] for e in lag]))
     assert widths[1] < 2 * widths[0]  # of two thirds of the samples: 1.2 times
     # A start of the user's own is taken as it is.
-    assert analysed(one.path, Options(start_s=1.0)).gait.fitted.start_s == pytest.approx(1.0)
+    assert analysed(log.path, Options(start_s=1.0)).gait.fitted.start_s == pytest.approx(1.0)

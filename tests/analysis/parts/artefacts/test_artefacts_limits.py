@@ -29,11 +29,11 @@ def test_torque_cut_at_the_stall_torque_is_a_limit(seed, tmp_path):
     asked = snake.effort[i:k, j] * snake.rng.uniform(20.0, 30.0)
     beyond = np.abs(asked) > STALL
     snake.effort[i:k, j] = np.clip(asked, -STALL, STALL)
-    (found,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
-    assert (found.joint, found.quantity) == (snake.robot.joint_names[j], "effort")
-    assert (found.flag, found.note) == ("saturated", "torque")
+    (artefact,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
+    assert (artefact.joint, artefact.quantity) == (snake.robot.joint_names[j], "effort")
+    assert (artefact.flag, artefact.note) == ("saturated", "torque")
     # By the sample: within two of each other, two stretches are one.
-    flagged = within(snake.t[i:k], found.spans_s)
+    flagged = within(snake.t[i:k], artefact.spans_s)
     assert np.mean(flagged == beyond) > 0.97
     assert not np.any(beyond & ~flagged)
 
@@ -46,9 +46,11 @@ def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
     (tmp_path / "weak.toml").write_text(twin_chains.wave(duration_s=5.0, settle_s=2.0, **weak))
     path = tmp_path / "weak.mcap"
     record(load_scenario(tmp_path / "weak.toml"), path)
-    found = planted_artefacts.artefacts(path)
-    assert {one.flag for one in found} == {"saturated"}
-    shown = {one.joint: one.spans_s for one in found if one.quantity == "voltage"}
+    artefacts = planted_artefacts.artefacts(path)
+    assert {artefact.flag for artefact in artefacts} == {"saturated"}
+    shown = {
+        artefact.joint: artefact.spans_s for artefact in artefacts if artefact.quantity == "voltage"
+    }
     with Session.open(path) as session:
         columns = read_columns(session, "/joint_commands", "/joint_states", lambda _: None)
         start_ns = session.start_ns

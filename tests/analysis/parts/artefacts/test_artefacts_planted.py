@@ -81,29 +81,32 @@ def test_a_planted_artefact_is_found_when_it_was_and_nothing_else(plant, tmp_pat
         j, (i, k) = snake.joint(), snake.span(shortest, shortest + 5.0)
         plant(snake, j, i, k)
         name = snake.robot.joint_names[j]
-        found = artefacts(snake.write(tmp_path / f"{seed}.mcap"))
+        flagged = artefacts(snake.write(tmp_path / f"{seed}.mcap"))
         here = [
-            one for one in found if (one.joint, one.flag, one.quantity) == (name, flag, quantity)
+            artefact
+            for artefact in flagged
+            if (artefact.joint, artefact.flag, artefact.quantity) == (name, flag, quantity)
         ]
         if not here:
             missed.append(seed)
             continue
         allowed = {flag} | brought
         false += [
-            (seed, one.joint, one.quantity, one.flag)
-            for one in found
-            if one.joint != name or not {one.flag, f"{one.quantity} {one.flag}"} & allowed
+            (seed, artefact.joint, artefact.quantity, artefact.flag)
+            for artefact in flagged
+            if artefact.joint != name
+            or not {artefact.flag, f"{artefact.quantity} {artefact.flag}"} & allowed
         ]
-        (one,) = here
-        met.append(overlap(one.spans_s, i / 100, k / 100))
+        (artefact,) = here
+        met.append(overlap(artefact.spans_s, i / 100, k / 100))
         # Nothing is reported of times far from it: cycle by cycle at most a cycle of 2 s.
-        assert min(a for a, _ in one.spans_s) > i / 100 - 2.01, seed
-        assert max(b for _, b in one.spans_s) < k / 100 + 2.01, seed
+        assert min(a for a, _ in artefact.spans_s) > i / 100 - 2.01, seed
+        assert max(b for _, b in artefact.spans_s) < k / 100 + 2.01, seed
     assert (missed, false) == ([], [])
     assert min(met) >= least, met
 
 
 @pytest.mark.nightly
 def test_sound_sessions_have_no_artefact(tmp_path):
-    found = {seed: artefacts(Snake(seed).write(tmp_path / f"{seed}.mcap")) for seed in SEEDS}
-    assert {seed: ones for seed, ones in found.items() if ones} == {}
+    flagged = {seed: artefacts(Snake(seed).write(tmp_path / f"{seed}.mcap")) for seed in SEEDS}
+    assert {seed: ones for seed, ones in flagged.items() if ones} == {}

@@ -51,16 +51,16 @@ def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path, opened)
     assert of_sensors(motor) == []
     assert motor.gait.frequency_hz.value == pytest.approx(1 / period, rel=0.01)
 
-    (found,) = of_sensors(analysed("/reader", "/motor"))
-    assert (found.flag, found.quantity) == ("scale_mismatch", "position")
-    assert found.topic == "/reader"
-    assert 0.87 < float(found.note.split(" ")[0]) < 0.91  # it tells about 10 % too little
-    (first, last) = found.spans_s[0][0], found.spans_s[-1][1]
+    (artefact,) = of_sensors(analysed("/reader", "/motor"))
+    assert (artefact.flag, artefact.quantity) == ("scale_mismatch", "position")
+    assert artefact.topic == "/reader"
+    assert 0.87 < float(artefact.note.split(" ")[0]) < 0.91  # it tells about 10 % too little
+    (first, last) = artefact.spans_s[0][0], artefact.spans_s[-1][1]
     assert last - first > 0.95 * opened(path).duration_s
 
-    (found,) = of_sensors(analysed("/wrapped"))
-    assert (found.flag, found.note) == ("wrapped", "turn of 12.57 rad")
-    assert len(found.spans_s) >= 10
+    (artefact,) = of_sensors(analysed("/wrapped"))
+    assert (artefact.flag, artefact.note) == ("wrapped", "turn of 12.57 rad")
+    assert len(artefact.spans_s) >= 10
 
 
 SO101 = ARCSNAKE.with_name("so101") / "coupled_joints"
@@ -89,7 +89,7 @@ def arm(tmp_path_factory):
         for k, t_ns in enumerate(asked_ns):
             command.write(t_ns, asked[k])
         for k, t_ns in enumerate(seen_ns):
-            state.write(t_ns, *(one[k] for one in seen))
+            state.write(t_ns, *(column[k] for column in seen))
     with Session.open(path) as session:
         return analyse_session(session)
 
@@ -109,9 +109,9 @@ def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
 
 @pytest.mark.nightly
 def test_their_dead_bands_explain_their_gains(arm):
-    found = {joint.name: joint for joint in arm.joints if joint.dead_band is not None}
-    assert set(found) == set(JOINTS) - {"Jaw"}  # whose band is below four steps of its encoder
-    for joint in found.values():
+    joints = {joint.name: joint for joint in arm.joints if joint.dead_band is not None}
+    assert set(joints) == set(JOINTS) - {"Jaw"}  # whose band is below four steps of its encoder
+    for joint in joints.values():
         band = joint.dead_band
         for end in (band.top, band.bottom):
             assert end.travel_ci95[0] < end.travel_rad < end.travel_ci95[1]

@@ -52,9 +52,9 @@ def test_a_joint_that_answers_upside_down_at_all_tones_is_reported(seed, tmp_pat
     j = snake.joint()
     snake.position[:, j] *= -1
     snake.velocity[:, j] *= -1
-    (found,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
-    assert (found.joint, found.quantity) == (snake.robot.joint_names[j], "position")
-    assert (found.flag, found.spans_s) == ("wrong_sign", (pytest.approx((0.0, snake.t[-1])),))
+    (artefact,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
+    assert (artefact.joint, artefact.quantity) == (snake.robot.joint_names[j], "position")
+    assert (artefact.flag, artefact.spans_s) == ("wrong_sign", (pytest.approx((0.0, snake.t[-1])),))
 
 
 def wave(lags_deg, upside_down=()):
@@ -81,6 +81,8 @@ def test_joints_that_lag_by_nearly_half_a_cycle_near_a_resonance_are_sound(tmp_p
 @pytest.mark.parametrize("upside_down", [DRIVEN[3:4], DRIVEN])
 def test_joints_that_answer_upside_down_are_reported(upside_down, lag_deg, tmp_path):
     snake = wave(np.full(len(DRIVEN), lag_deg), upside_down)
-    found = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
-    assert {one.flag for one in found} == {"wrong_sign"}
-    assert {one.joint for one in found} == {snake.robot.joint_names[j] for j in upside_down}
+    artefacts = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
+    assert {artefact.flag for artefact in artefacts} == {"wrong_sign"}
+    assert {artefact.joint for artefact in artefacts} == {
+        snake.robot.joint_names[j] for j in upside_down
+    }

@@ -89,8 +89,8 @@ def test_intervals_cover_what_noise_does():
     for seed in range(40):
         (plane,) = shapes(lambda k, x: 0.3 * np.cos(x - 0.6 * k), 7, noise=0.02, seed=seed)
         curve = plane.serpenoid
-        known = ((curve.amplitude_rad, 0.3), (curve.wave_number, 0.6), (curve.phase_rad, 0.0))
-        hits.append([one.ci95[0] <= value <= one.ci95[1] for one, value in known])
+        expected = ((curve.amplitude_rad, 0.3), (curve.wave_number, 0.6), (curve.phase_rad, 0.0))
+        hits.append([estimate.ci95[0] <= value <= estimate.ci95[1] for estimate, value in expected])
     assert np.all(np.mean(hits, axis=0) >= 0.85)
 
 

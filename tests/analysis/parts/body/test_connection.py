@@ -27,7 +27,7 @@ def cycles(count=16, size=0.1, seed=0, joints=6):
 
 
 @pytest.fixture(scope="module")
-def known():
+def base_cycles():
     return cycles()
 
 
@@ -37,8 +37,8 @@ def truth(base):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_connection_is_that_of_force_and_moment_balance(known, seed):
-    model = fit_connection(known if seed == 0 else cycles(12, 0.12, seed))
+def test_the_connection_is_that_of_force_and_moment_balance(base_cycles, seed):
+    model = fit_connection(base_cycles if seed == 0 else cycles(12, 0.12, seed))
     assert model.identified
     value, half = model.matrices(PHASES)
     expected = truth(model.base)
@@ -56,63 +56,72 @@ def test_errors_fall_with_the_size_of_the_perturbations():
     assert error(0.05) < 0.4 * error(0.2)
 
 
-def test_a_held_out_gait_is_predicted_within_its_interval(known):
-    model = fit_connection(known)
+def test_a_held_out_gait_is_predicted_within_its_interval(base_cycles):
+    model = fit_connection(base_cycles)
     held = cycles(16, size=0.07, seed=5)[1:]
-    inside = [one for one in held if model.outside(one.shape) is None]
+    inside = [cycle for cycle in held if model.outside(cycle.shape) is None]
     assert len(inside) > 8
     hits = []
-    for one in inside:
-        value, half = model.predict(one.shape)
-        hits.append(np.abs(value - one.steps[0]) <= half)
-        assert abs(value[0] - one.steps[0, 0]) < 0.02 * one.steps[0, 0]
+    for cycle in inside:
+        value, half = model.predict(cycle.shape)
+        hits.append(np.abs(value - cycle.steps[0]) <= half)
+        assert abs(value[0] - cycle.steps[0, 0]) < 0.02 * cycle.steps[0, 0]
     assert np.mean(hits) > 0.9
 
 
-def test_speed_and_phase_of_a_gait_do_not_matter(known):
-    shift = np.exp(1j * 0.7 * np.arange(known[0].shape.shape[1]))
-    moved = [SWIMMER.cycle(one.shape * shift, omega=5.0) for one in known[1:4]]
-    one, other = fit_connection(known), fit_connection([known[0], *moved, *known[4:]])
-    shape = known[5].shape
-    np.testing.assert_allclose(one.predict(shape)[0], other.predict(shape * shift)[0], rtol=1e-6)
+def test_speed_and_phase_of_a_gait_do_not_matter(base_cycles):
+    shift = np.exp(1j * 0.7 * np.arange(base_cycles[0].shape.shape[1]))
+    moved = [SWIMMER.cycle(cycle.shape * shift, omega=5.0) for cycle in base_cycles[1:4]]
+    fit, other = (
+        fit_connection(base_cycles),
+        fit_connection([base_cycles[0], *moved, *base_cycles[4:]]),
+    )
+    shape = base_cycles[5].shape
+    np.testing.assert_allclose(fit.predict(shape)[0], other.predict(shape * shift)[0], rtol=1e-6)
 
 
-def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(known):
+def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(base_cycles):
     def at(k, frequency):
-        return GaitSession(f"{k}", dataclasses.replace(known[k], omega=2 * np.pi * frequency))
+        return GaitSession(f"{k}", dataclasses.replace(base_cycles[k], omega=2 * np.pi * frequency))
 
     speeds = {3: 0.52, 5: 1.0, 7: 0.72}
-    sessions = [at(k, speeds.get(k, 0.5)) for k in range(len(known))]
-    found, why = body_connection(sessions)
+    sessions = [at(k, speeds.get(k, 0.5)) for k in range(len(base_cycles))]
+    connection, why = body_connection(sessions)
     assert why == {5: "has another speed: its frequency is 2 times the median of the sessions"}
-    assert found.gaits == 15
-    bare = [one.path for one in found.predicted if one.why is None and one.forward_m.ci95 is None]
+    assert connection.gaits == 15
+    bare = [
+        prediction.path
+        for prediction in connection.predicted
+        if prediction.why is None and prediction.forward_m.ci95 is None
+    ]
     assert set(bare) <= {"5", "7"}
     assert "7" in bare
     sentence = f"No interval for {len(bare)} of the predictions: the gait's frequency is more"
-    assert any(line.startswith(sentence) for line in connection_detail(found))
-    found, why = body_connection([*sessions[:5], at(5, 4.0), *sessions[6:]])
+    assert any(line.startswith(sentence) for line in connection_detail(connection))
+    connection, why = body_connection([*sessions[:5], at(5, 4.0), *sessions[6:]])
     assert list(why) == [5]
-    assert "inertia is not in the model" in found.predicted[5].why
+    assert "inertia is not in the model" in connection.predicted[5].why
 
 
-def test_an_experiment_with_a_model_is_saved_and_loaded(known, both_ways, tmp_path):
-    body, _ = body_connection([GaitSession(f"{k}", one) for k, one in enumerate(known[:9])])
+def test_an_experiment_with_a_model_is_saved_and_loaded(base_cycles, both_ways, tmp_path):
+    body, _ = body_connection(
+        [GaitSession(f"{k}", cycle) for k, cycle in enumerate(base_cycles[:9])]
+    )
     assert body.A
     whole = dataclasses.replace(both_ways, body_connection=body)
     assert load(whole.save(tmp_path / "experiment.json")) == whole
 
 
-def test_outside_the_range_names_the_mode_and_how_far(known):
-    model = fit_connection(known)
+def test_outside_the_range_names_the_mode_and_how_far(base_cycles):
+    model = fit_connection(base_cycles)
     far = model.base
-    third = np.zeros_like(known[0].shape)
+    third = np.zeros_like(base_cycles[0].shape)
     third[:, 0] = 2 * far.largest[2] * far.modes[:, 2]
-    why = model.outside(known[0].shape + third)
+    why = model.outside(base_cycles[0].shape + third)
     assert why.startswith("shape mode 3 is perturbed by")
     assert "times the largest perturbation that the model is fitted to" in why
     fourth = np.linalg.qr(np.column_stack([far.modes, np.arange(6.0)]))[0][:, 3]
-    strange = known[0].shape.copy()
+    strange = base_cycles[0].shape.copy()
     strange[:, 1] += 0.2 * fourth
     assert "are in none of the modes" in model.outside(strange)
 
@@ -131,37 +140,44 @@ def test_a_kind_of_perturbation_that_no_gait_shows_is_refused():
 
 
 @pytest.mark.parametrize("count", [1, 7])
-def test_too_few_gaits_are_refused(known, count):
+def test_too_few_gaits_are_refused(base_cycles, count):
     with pytest.raises(DataError, match=r"at least 8 gaits .* condition number is ") as caught:
-        fit_connection(known[:count])
+        fit_connection(base_cycles[:count])
     assert ("inf" in str(caught.value)) is (count == 1)
 
 
-def test_repeats_of_one_gait_are_refused(known):
+def test_repeats_of_one_gait_are_refused(base_cycles):
     random = np.random.default_rng(1)
     noisy = [
-        SWIMMER.cycle(known[0].shape * (1 + 1e-3 * random.standard_normal(known[0].shape.shape)))
+        SWIMMER.cycle(
+            base_cycles[0].shape * (1 + 1e-3 * random.standard_normal(base_cycles[0].shape.shape))
+        )
         for _ in range(10)
     ]
     with pytest.raises(DataError, match="the 10 gaits are too much alike: the condition number"):
         fit_connection(noisy)
 
 
-def test_a_reversed_wave_is_another_gait(known):
-    reverse = SWIMMER.cycle(known[0].shape[::-1])
-    off = distances([*known, reverse])
+def test_a_reversed_wave_is_another_gait(base_cycles):
+    reverse = SWIMMER.cycle(base_cycles[0].shape[::-1])
+    off = distances([*base_cycles, reverse])
     assert off[-1] > 1
     assert np.all(off[:-1] < 0.3)
-    found, why = body_connection([None, *(GaitSession(f"{k}", one) for k, one in enumerate(known))])
-    assert found.fitted
-    assert found.gaits == len(known)
+    connection, why = body_connection(
+        [None, *(GaitSession(f"{k}", cycle) for k, cycle in enumerate(base_cycles))]
+    )
+    assert connection.fitted
+    assert connection.gaits == len(base_cycles)
     assert why == {0: "has no planar gait with the head's pose and all joint angles"}
-    both = [GaitSession(f"{k}", one) for k, one in enumerate([*known, reverse, known[3]])]
-    found, why = body_connection(both)
-    assert found.gaits == len(known)
+    both = [
+        GaitSession(f"{k}", cycle)
+        for k, cycle in enumerate([*base_cycles, reverse, base_cycles[3]])
+    ]
+    connection, why = body_connection(both)
+    assert connection.gaits == len(base_cycles)
     assert "is another gait: its joint angles differ from the central one by 1" in why[16]
     assert why[17] == "is a copy of another session"
-    assert found.predicted[16].why.startswith("shape mode")
-    one = body_connection(both[:1])[0]
-    assert not one.fitted
-    assert one.condition_number is None
+    assert connection.predicted[16].why.startswith("shape mode")
+    lone = body_connection(both[:1])[0]
+    assert not lone.fitted
+    assert lone.condition_number is None

@@ -36,17 +36,19 @@ def scenario(base, gait, ground=None, cycles=SETTLE + MEASURED):
     return dataclasses.replace(base, gait=wave, world=world, duration_s=round(seconds, 2))
 
 
-def limited(one, amplitudes):
+def limited(original, amplitudes):
     """Limit the yaw joints to amplitudes about the gait's offset."""
-    offset, own = one.gait.planes[Plane.HORIZONTAL].offset, iter(amplitudes)
+    offset, limits = original.gait.planes[Plane.HORIZONTAL].offset, iter(amplitudes)
     joints = [
         joint
         if joint.plane is Plane.VERTICAL
         else dataclasses.replace(joint, lower=offset - a, upper=offset + a)
-        for joint in one.robot.joints
-        for a in ([0.0] if joint.plane is Plane.VERTICAL else [float(next(own))])
+        for joint in original.robot.joints
+        for a in ([0.0] if joint.plane is Plane.VERTICAL else [float(next(limits))])
     ]
-    return dataclasses.replace(one, robot=dataclasses.replace(one.robot, joints=tuple(joints)))
+    return dataclasses.replace(
+        original, robot=dataclasses.replace(original.robot, joints=tuple(joints))
+    )
 
 
 def cycle_of(run, frequency, cycles=MEASURED):
@@ -88,11 +90,11 @@ def perfect_tracking(robot, gait, ratio):
 
 def nearest(model, cycles, cycle):
     """Return the step of the nearest gait, scaled by amplitude squared; a cycle knows no speed."""
-    own = turned(cycle.shape, model.base.phase(cycle.shape))
-    off = [np.linalg.norm(turned(c.shape, model.base.phase(c.shape)) - own) for c in cycles]
-    one = cycles[int(np.argmin(off))]
-    size = [np.linalg.norm(c.shape[:, 1]) for c in (cycle, one)]
-    step = one.steps.mean(axis=0) * (size[0] / size[1]) ** 2
+    shape = turned(cycle.shape, model.base.phase(cycle.shape))
+    off = [np.linalg.norm(turned(c.shape, model.base.phase(c.shape)) - shape) for c in cycles]
+    neighbour = cycles[int(np.argmin(off))]
+    size = [np.linalg.norm(c.shape[:, 1]) for c in (cycle, neighbour)]
+    step = neighbour.steps.mean(axis=0) * (size[0] / size[1]) ** 2
     return np.hypot(*step[:2]), step[2]
 
 
@@ -103,8 +105,8 @@ def test_held_out_gaits_under_coulomb_friction_at_two_speeds():
     held = [gait for f in (0.5, 1.0) for gait in drawn(random, 12, f, 0.8)]
     far = [(0.2, 0.5, math.pi / 3, 0.0), (0.35, 0.5, math.pi / 3, 0.15), (0.35, 0.5, 0.8, 0.0)]
     cycles = cycles_of(base, [*fitted, *held, *far])
-    known, rest, beyond = cycles[:16], cycles[16:40], cycles[40:]
-    model = fit_connection(known)
+    fitted_cycles, rest, beyond = cycles[:16], cycles[16:40], cycles[40:]
+    model = fit_connection(fitted_cycles)
     for cycle in beyond:
         assert model.outside(cycle.shape) is not None
     for frequency in (0.5, 1.0):
@@ -118,7 +120,7 @@ def test_held_out_gaits_under_coulomb_friction_at_two_speeds():
             guesses = [
                 (np.hypot(*value[:2]), value[2]),
                 *(perfect_tracking(base.robot, gait, ratio) for ratio in (10.0, 1e4)),
-                nearest(model, known, cycle),
+                nearest(model, fitted_cycles, cycle),
             ]
             gone = np.hypot(*step[:2])
             errors.append([(abs(d - gone), abs(turn - step[2])) for d, turn in guesses])
@@ -150,10 +152,10 @@ def test_the_connection_of_a_viscous_chain_is_that_of_force_and_moment_balance(t
             backward=0.0,
             start_phase=tuple((0.06 * off[3:6]).tolist()),
         )
-        one = scenario(base, (1.0, SLOW, 1.0, 0.03 * off[6]), ground, cycles=3)
+        variant = scenario(base, (1.0, SLOW, 1.0, 0.03 * off[6]), ground, cycles=3)
         # A command of 1 rad is cut to what each joint's limits leave: amplitudes of their own.
-        one = limited(one, 0.35 * (1 + 0.06 * off[:3]))
-        runs.append(dataclasses.replace(one, gait=OscillatorChains({Plane.HORIZONTAL: chain})))
+        variant = limited(variant, 0.35 * (1 + 0.06 * off[:3]))
+        runs.append(dataclasses.replace(variant, gait=OscillatorChains({Plane.HORIZONTAL: chain})))
     cycles = [cycle_of(run, SLOW, cycles=2) for run in run_batch(runs)]
     model = fit_connection(cycles)
     swimmer = Swimmer(0.06, 1.0, 10.0, turning=0.0)
@@ -172,6 +174,6 @@ def test_the_connection_of_a_viscous_chain_is_that_of_force_and_moment_balance(t
     assert model.identified
     # Inertia, and links that pitch under their drag, are not in the closed form.
     assert np.mean(np.abs(value - expected) <= half) > 0.91
-    error, size = (np.sqrt(np.mean(one**2, axis=0)) for one in (value - expected, expected))
+    error, size = (np.sqrt(np.mean(steps**2, axis=0)) for steps in (value - expected, expected))
     assert error[0, 0] < 0.02 * size[0, 0]
     assert error[2, 0] < 0.05 * size[2, 0]

@@ -49,8 +49,8 @@ def test_speed_of_the_viscous_slender_body(links, lag, a, stated):
     """Serpenoid theta = a sin(.), K = 10; formula of the slender body after Gray & Hancock 1955."""
     omega, ratio = 2.0, 10.0
     joint_amplitude = 2 * a * np.sin(lag / 2)
-    one = np.ones(links)
-    chain = RigidChain(one, one, ratio * one, ratio * one / 12)
+    ones = np.ones(links)
+    chain = RigidChain(ones, ones, ratio * ones, ratio * ones / 12)
     motion = one_cycle(chain, wave(links - 1, lag, joint_amplitude), np.zeros(links - 1), omega)
     speed = abs(motion.displacement) * omega / (2 * np.pi)
     beta = (1 - j0(2 * a)) / 2
@@ -95,9 +95,9 @@ def test_a_free_chain_keeps_its_momentum_at_zero():
 
 
 def test_two_free_links_share_the_turn_by_symmetry():
-    one = np.ones(2)
+    ones = np.ones(2)
     motion = one_cycle(
-        RigidChain(one, one, one, one / 12), np.array([[0.5 + 0j]]), np.zeros(1), 2.0
+        RigidChain(ones, ones, ones, ones / 12), np.array([[0.5 + 0j]]), np.zeros(1), 2.0
     )
     # Equal links turn by equal and opposite amounts: the head by minus half of the joint angle.
     swing = motion.heading - motion.heading[0]

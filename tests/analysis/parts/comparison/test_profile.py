@@ -20,8 +20,8 @@ SIGMA, COLUMNS = 1e-3, 24
 
 
 def scatter(rng, joints, shared=0.0):
-    own, common = rng.standard_normal((joints, COLUMNS)), rng.standard_normal((1, COLUMNS))
-    columns = SIGMA * (math.sqrt(1 - shared) * own + math.sqrt(shared) * common)
+    separate, common = rng.standard_normal((joints, COLUMNS)), rng.standard_normal((1, COLUMNS))
+    columns = SIGMA * (math.sqrt(1 - shared) * separate + math.sqrt(shared) * common)
     return Scatter(columns, np.zeros(joints), np.zeros(joints))
 
 
@@ -45,8 +45,8 @@ def test_the_critical_value_of_contrasts_is_the_quantile_of_the_largest(
 ):
     noise = np.random.default_rng(count).standard_normal((count, columns))
     many = Scatter(noise, np.zeros(count), np.zeros(count))
-    found = critical_value([Member(np.eye(count), many)], draws=draws)
-    assert found == pytest.approx(expected, abs=within)
+    critical = critical_value([Member(np.eye(count), many)], draws=draws)
+    assert critical == pytest.approx(expected, abs=within)
 
 
 @pytest.mark.nightly
@@ -55,10 +55,14 @@ def test_identical_joints_rarely_differ(shared):
     rng = np.random.default_rng(3)
     wrong = 0
     for _ in range(200):
-        one = profile(rng, np.full(9, 0.5), shared=shared)
-        critical = critical_value([family_of(one)], draws=2000)
-        claims = [c for c in contrasts(one, np.ones(9, bool)) if abs(c.value) > critical * c.error]
-        wrong += bool(standing_out(one, critical)) or bool(claims)
+        joint_profile = profile(rng, np.full(9, 0.5), shared=shared)
+        critical = critical_value([family_of(joint_profile)], draws=2000)
+        claims = [
+            c
+            for c in contrasts(joint_profile, np.ones(9, bool))
+            if abs(c.value) > critical * c.error
+        ]
+        wrong += bool(standing_out(joint_profile, critical)) or bool(claims)
     assert wrong <= 20  # 10 are expected, 20 or more have a chance of 0.3 %
 
 
@@ -68,18 +72,23 @@ def test_a_joint_that_is_off_is_named_wherever_it_is(joint):
     for _ in range(20):
         values = np.full(9, 0.5)
         values[joint] += 15 * SIGMA
-        one = profile(rng, values)
-        found = standing_out(one, critical_value([family_of(one)], draws=2000))[0]
-        assert (found.joint, found.value) == (joint, pytest.approx(15 * SIGMA, abs=5 * SIGMA))
+        joint_profile = profile(rng, values)
+        deviation = standing_out(
+            joint_profile, critical_value([family_of(joint_profile)], draws=2000)
+        )[0]
+        assert (deviation.joint, deviation.value) == (
+            joint,
+            pytest.approx(15 * SIGMA, abs=5 * SIGMA),
+        )
 
 
 def test_two_that_are_off_do_not_hide_each_other():
     rng = np.random.default_rng(5)
     values = np.full(12, 0.5)
     values[[2, 7]] -= 30 * SIGMA, 20 * SIGMA
-    one = profile(rng, values)
-    found = standing_out(one, critical_value([family_of(one)], draws=300))
-    assert [each.joint for each in found] == [2, 7]
+    joint_profile = profile(rng, values)
+    deviations = standing_out(joint_profile, critical_value([family_of(joint_profile)], draws=300))
+    assert [deviation.joint for deviation in deviations] == [2, 7]
 
 
 @pytest.mark.parametrize("first", range(1, 6))
@@ -87,9 +96,9 @@ def test_two_at_mirror_positions_are_named_unless_their_neighbours_follow(first)
     rng = np.random.default_rng(first)
     values = np.full(13, 0.5)
     values[[first, 12 - first]] -= 30 * SIGMA
-    one = profile(rng, values)
-    found = standing_out(one, critical_value([family_of(one)], draws=300))
-    assert {each.joint for each in found} == {first, 12 - first}
+    joint_profile = profile(rng, values)
+    deviations = standing_out(joint_profile, critical_value([family_of(joint_profile)], draws=300))
+    assert {deviation.joint for deviation in deviations} == {first, 12 - first}
     along = np.linspace(-1, 1, 13)
     smooth = profile(rng, 0.5 - 30 * SIGMA * np.exp(-(((abs(along) - 0.5) / 0.3) ** 2)))
     assert standing_out(smooth, critical_value([family_of(smooth)], draws=300)) == []
@@ -104,8 +113,8 @@ def test_two_at_mirror_positions_are_named_unless_their_neighbours_follow(first)
 )
 def test_two_kinds_of_joints_are_found_with_a_weak_one_among_them(values, first):
     values = values + 1e-3 * np.random.default_rng(1).standard_normal(values.size)
-    found = split_of(values, 0.02)
-    assert found.first.tolist() == first
+    split = split_of(values, 0.02)
+    assert split.first.tolist() == first
     values[first[1]] -= 0.3
     assert split_of(np.asarray(values), 0.02) is not None
 
@@ -137,8 +146,8 @@ def test_below_the_margin_nobody_is_named():
     rng = np.random.default_rng(6)
     values = np.full(9, 0.5)
     values[3] += 15 * SIGMA
-    one = profile(rng, values, margin=0.02)
-    assert standing_out(one, critical_value([family_of(one)], draws=300)) == []
+    joint_profile = profile(rng, values, margin=0.02)
+    assert standing_out(joint_profile, critical_value([family_of(joint_profile)], draws=300)) == []
 
 
 def test_a_joint_at_the_margin_is_named():
@@ -148,9 +157,11 @@ def test_a_joint_at_the_margin_is_named():
         rng = np.random.default_rng(100 + seed)
         values = np.full(9, 0.5)
         values[3] += 0.02
-        one = profile(rng, values, margin=0.02)
-        found = standing_out(one, critical_value([family_of(one)], draws=300))
-        named += [each.joint for each in found] == [3]
+        joint_profile = profile(rng, values, margin=0.02)
+        deviations = standing_out(
+            joint_profile, critical_value([family_of(joint_profile)], draws=300)
+        )
+        named += [deviation.joint for deviation in deviations] == [3]
     assert named >= 18
 
 
@@ -163,17 +174,19 @@ def test_a_joint_at_the_margin_is_named():
     ],
 )
 def test_a_smooth_profile_is_a_shape_and_names_nobody(shape, kind):
-    one = profile(np.random.default_rng(7), 0.5 + shape(np.linspace(-1, 1, 13)))
-    critical = critical_value([family_of(one)], draws=300)
-    assert standing_out(one, critical) == []
-    found = {contrast.kind: contrast for contrast in contrasts(one, np.ones(13, bool))}
-    assert abs(found[kind].value) > critical * found[kind].error
+    joint_profile = profile(np.random.default_rng(7), 0.5 + shape(np.linspace(-1, 1, 13)))
+    critical = critical_value([family_of(joint_profile)], draws=300)
+    assert standing_out(joint_profile, critical) == []
+    by_kind = {contrast.kind: contrast for contrast in contrasts(joint_profile, np.ones(13, bool))}
+    assert abs(by_kind[kind].value) > critical * by_kind[kind].error
 
 
 def test_a_joint_stands_out_of_a_profile_too():
     rng = np.random.default_rng(8)
     values = 0.5 + 0.05 * np.linspace(-1, 1, 13)
     values[5] -= 0.05
-    one = profile(rng, values)
-    (found,) = standing_out(one, critical_value([family_of(one)], draws=300))
-    assert (found.joint, found.value) == (5, pytest.approx(-0.05, abs=0.01))
+    joint_profile = profile(rng, values)
+    (deviation,) = standing_out(
+        joint_profile, critical_value([family_of(joint_profile)], draws=300)
+    )
+    assert (deviation.joint, deviation.value) == (5, pytest.approx(-0.05, abs=0.01))

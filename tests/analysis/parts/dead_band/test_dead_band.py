@@ -19,8 +19,8 @@ JOINTS = 6
 def measured(kind, steps, seed=0, joints=JOINTS, **how):
     rng = np.random.default_rng(seed)
     made = [Joint(rng, kind, steps * STEP, **how) for _ in range(joints)]
-    found, gait = found_in(made)
-    return made, found, gait
+    bands, gait = found_in(made)
+    return made, bands, gait
 
 
 @settings(max_examples=50, deadline=None)
@@ -52,9 +52,9 @@ def test_it_changes_the_fundamental_as_its_describing_function_has_it(share):
 @pytest.mark.parametrize("kind", ["play", "play behind a lag", "stick"])
 @pytest.mark.parametrize("steps", [5, 20])
 def test_its_width_is_found_within_a_tenth_and_the_interval_covers(kind, steps):
-    _, found, _ = measured(kind, steps)
-    assert len(found) == JOINTS
-    ends = [end for one in found.values() for end in (one.top, one.bottom)]
+    _, bands, _ = measured(kind, steps)
+    assert len(bands) == JOINTS
+    ends = [end for band in bands.values() for end in (band.top, band.bottom)]
     width = steps * STEP
     within = [abs(end.travel_rad / width - 1) <= 0.1 for end in ends]
     covers = [end.travel_ci95[0] <= width <= end.travel_ci95[1] for end in ends]
@@ -70,10 +70,10 @@ def test_its_width_is_found_within_a_tenth_and_the_interval_covers(kind, steps):
 def test_also_in_step_with_the_gait_in_noise_and_sampled_fast(kind, how):
     within, covers = [], []
     for steps in (6,):
-        _, found, _ = measured(kind, steps, seed=steps, **how)
-        assert len(found) == JOINTS
-        for one in found.values():
-            for end in (one.top, one.bottom):
+        _, bands, _ = measured(kind, steps, seed=steps, **how)
+        assert len(bands) == JOINTS
+        for band in bands.values():
+            for end in (band.top, band.bottom):
                 within.append(abs(end.travel_rad / (steps * STEP) - 1) <= 0.1)
                 covers.append(end.travel_ci95[0] <= steps * STEP <= end.travel_ci95[1])
     assert np.mean(within) >= 0.95
@@ -82,44 +82,44 @@ def test_also_in_step_with_the_gait_in_noise_and_sampled_fast(kind, how):
 
 @pytest.mark.nightly
 def test_a_joint_that_breaks_away_catches_up_by_its_step():
-    made, found, _ = measured("stick", 30, excess=15 * STEP, lag_s=0.02)
-    assert len(found) == JOINTS
-    for k, one in found.items():
-        for end in (one.top, one.bottom):
+    made, bands, _ = measured("stick", 30, excess=15 * STEP, lag_s=0.02)
+    assert len(bands) == JOINTS
+    for k, band in bands.items():
+        for end in (band.top, band.bottom):
             assert end.travel_rad == pytest.approx(30 * STEP, rel=0.1)
             assert end.step_rad == pytest.approx(made[k].gain * 15 * STEP, rel=0.2)
 
 
 @pytest.mark.nightly
 def test_what_it_does_to_gain_and_lag_is_its_share_of_them():
-    made, found, gait = measured("play", 25)
-    for k, one in found.items():
+    made, bands, gait = measured("play", 25)
+    for k, band in bands.items():
         joint = made[k]
         ideal = fundamental_change(joint.t_s, joint.command, joint.ideal, gait.fit.omega)
         delay = cmath.exp(-1j * gait.fit.omega * 0.06)
-        assert one.gain_change == pytest.approx(abs(ideal / delay), abs=0.01)
-        assert one.lag_change_rad == pytest.approx(-cmath.phase(ideal / delay), abs=0.01)
+        assert band.gain_change == pytest.approx(abs(ideal / delay), abs=0.01)
+        assert band.lag_change_rad == pytest.approx(-cmath.phase(ideal / delay), abs=0.01)
 
 
 @pytest.mark.parametrize("how", [{}, {"step": 0.0, "noise": 2e-3}, {"lag_s": 0.4}])
 def test_a_linear_joint_has_none(how):
-    _, found, _ = measured("linear", 0, **how)
-    assert found == {}
+    _, bands, _ = measured("linear", 0, **how)
+    assert bands == {}
 
 
 def test_less_than_four_steps_of_the_encoder_are_not_claimed():
-    _, found, _ = measured("play", 2)
-    assert found == {}
+    _, bands, _ = measured("play", 2)
+    assert bands == {}
 
 
 def test_a_clipped_sensor_has_none():
     rng = np.random.default_rng(1)
     made = [Joint(rng, "linear", 0.0) for _ in range(3)]
-    for one in made:
-        middle = np.median(one.position)
-        one.position = middle + np.clip(one.position - middle, -0.1, 0.1)
-    found, _ = found_in(made)
-    assert found == {}
+    for joint in made:
+        middle = np.median(joint.position)
+        joint.position = middle + np.clip(joint.position - middle, -0.1, 0.1)
+    bands, _ = found_in(made)
+    assert bands == {}
 
 
 @pytest.mark.nightly
@@ -138,9 +138,9 @@ def test_effort_or_a_second_sensor_tell_stick_from_play(witness, kind):
     rng = np.random.default_rng(2)
     made = [Joint(rng, "play", 20 * STEP, lag_s=0.02) for _ in range(2)]
     seen = {}
-    for one in made:
-        pull = np.clip((one.command - one.ideal) / (10 * STEP), -1, 1)
-        rests = np.concatenate(([False], np.diff(one.ideal) == 0))
+    for joint in made:
+        pull = np.clip((joint.command - joint.ideal) / (10 * STEP), -1, 1)
+        rests = np.concatenate(([False], np.diff(joint.ideal) == 0))
         effort = {
             "ramp": pull,
             "load": np.abs(pull),
@@ -151,7 +151,7 @@ def test_effort_or_a_second_sensor_tell_stick_from_play(witness, kind):
             noisy = effort + rng.normal(0, 0.01, pull.size)
             seen.setdefault("effort", []).append(np.abs(noisy) if witness == "load" else noisy)
         if witness == "second":
-            seen.setdefault("second", []).append(one.command + rng.normal(0, 1e-4, pull.size))
-    found, _ = found_in(made, **seen)
-    assert [one.kind for one in found.values()] == [kind] * 2
-    assert all(one.evidence for one in found.values())
+            seen.setdefault("second", []).append(joint.command + rng.normal(0, 1e-4, pull.size))
+    bands, _ = found_in(made, **seen)
+    assert [band.kind for band in bands.values()] == [kind] * 2
+    assert all(band.evidence for band in bands.values())

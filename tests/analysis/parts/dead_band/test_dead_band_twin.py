@@ -60,10 +60,10 @@ def two_joints(width, stall_torque):
 @pytest.mark.parametrize("steps", [6, 20])
 def test_its_width_is_found_within_a_tenth_and_covered(steps, stall_torque):
     width = steps * STEP
-    found, _ = found_in(two_joints(width, stall_torque))
-    assert set(found) == {0, 1}
-    for one in found.values():
-        for end in (one.top, one.bottom):
+    bands, _ = found_in(two_joints(width, stall_torque))
+    assert set(bands) == {0, 1}
+    for band in bands.values():
+        for end in (band.top, band.bottom):
             assert end.travel_rad == pytest.approx(width, rel=0.1)
             assert end.travel_ci95[0] <= width <= end.travel_ci95[1]
             assert end.step_ci95[0] == 0.0

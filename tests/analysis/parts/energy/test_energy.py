@@ -64,13 +64,13 @@ def test_power_of_signals_sampled_at_other_times():
 def test_a_factor_reaches_from_its_first_sample_to_its_last():
     t = np.arange(10) * 10_000_000
     current = Signal("q", "A", t, np.full(10, 2.0))
-    known = np.array([2, 3, 4, 6, 7]) * 10_000_000  # no gap: one of 20 ms
-    power = power_of(current, Signal("q", "V", known, known * 1e-6), 0)
+    volt_ns = np.array([2, 3, 4, 6, 7]) * 10_000_000  # no gap: one of 20 ms
+    power = power_of(current, Signal("q", "V", volt_ns, volt_ns * 1e-6), 0)
     np.testing.assert_allclose(power.t_s, np.arange(2, 8) * 0.01)
     np.testing.assert_allclose(power.values, 2 * np.arange(20.0, 80.0, 10.0))
-    alone = power_of(current, Signal("q", "V", known[:1], known[:1] * 1e-6), 0)
+    alone = power_of(current, Signal("q", "V", volt_ns[:1], volt_ns[:1] * 1e-6), 0)
     assert (alone.count, alone.dropped_nan) == (0, 10)
-    two = power_of(current, Signal("q", "V", known[:2], known[:2] * 1e-6), 0)
+    two = power_of(current, Signal("q", "V", volt_ns[:2], volt_ns[:2] * 1e-6), 0)
     np.testing.assert_allclose(two.values, [40.0, 60.0])
 
 
@@ -178,7 +178,7 @@ def test_a_window_takes_its_part_of_the_intervals_at_its_edges():
 def test_a_lost_message_is_a_gap_of_one_interval():
     net, plus = accumulated(np.ones_like, 800)
     kept = np.delete(np.arange(800), [5, 6, 400])
-    lost = [Series("q", one.t_s[kept], one.values[kept]) for one in (net, plus)]
+    lost = [Series("q", power.t_s[kept], power.values[kept]) for power in (net, plus)]
     energy = add_up(*lost, -3.0, 5.0, 8)
     np.testing.assert_allclose(energy.net_j, [0.98, 1, 1, 1, 0.99, 1, 1, 1])
     np.testing.assert_allclose(energy.covered, energy.net_j)

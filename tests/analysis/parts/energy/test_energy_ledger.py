@@ -128,8 +128,8 @@ def test_without_work_in_the_ledger_there_are_no_shares():
 def test_a_term_is_the_difference_between_the_windows_ends():
     rates = {"a": 1.0, "b": 2.0, "c": 3.0, "d": 4.0, "e": 5.0, "f": 6.0}
     rows = {"b": [4.0], "c": [3.0, 5.0], "d": [6.0, 7.0], "e": [6.1, 7.0], "f": []}
-    found = energy.booked_energies(with_ledger(rates, rows), SPAN)
-    assert found == pytest.approx({"a": 4.0, "c": 6.0, "d": 0.0})  # held beyond its samples
+    terms = energy.booked_energies(with_ledger(rates, rows), SPAN)
+    assert terms == pytest.approx({"a": 4.0, "c": 6.0, "d": 0.0})  # held beyond its samples
     assert energy.booked_energies(SimpleNamespace(channels={}), SPAN) is None
 
 

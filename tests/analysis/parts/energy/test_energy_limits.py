@@ -53,26 +53,26 @@ def test_means_of_intervals_add_up_to_boxes_also_beyond_the_samples(start_s, sto
     t_s = np.delete(np.arange(100), [20, 21, 50]) * 0.02 + 0.01
     powers = np.random.default_rng(1).normal(0.3, 1.0, t_s.size)
     net, plus = Series("q", t_s, powers), Series("q", t_s, np.maximum(powers, 0.0))
-    found = add_up(net, plus, start_s, stop_s, cycles)
+    sums = add_up(net, plus, start_s, stop_s, cycles)
     edges = np.linspace(start_s, stop_s, cycles + 1)
     energies, times = counted(t_s, powers, edges)
     if not times.any():
-        assert found is None
+        assert sums is None
         return
-    np.testing.assert_allclose(found.net_j, energies, atol=1e-12)
-    np.testing.assert_allclose(found.plus_j, counted(t_s, plus.values, edges)[0], atol=1e-12)
+    np.testing.assert_allclose(sums.net_j, energies, atol=1e-12)
+    np.testing.assert_allclose(sums.plus_j, counted(t_s, plus.values, edges)[0], atol=1e-12)
     share = times / np.diff(edges)
-    np.testing.assert_allclose(found.covered, share, atol=1e-12)
-    assert found.coverage == pytest.approx(share.mean(), abs=1e-12)
+    np.testing.assert_allclose(sums.covered, share, atol=1e-12)
+    assert sums.coverage == pytest.approx(share.mean(), abs=1e-12)
 
 
 def test_intervals_that_come_close_to_each_other_cover_a_window_once():
     t_s = np.arange(40) * 0.05 + np.tile([0.025, 0.03], 20)  # 45 and 55 ms apart
     t_s[20:30] -= 0.001 * np.arange(10)
     ones = Series("q", t_s, np.ones(40))
-    found = add_up(ones, ones, 0.0, 2.0, 8)
-    assert found.covered.max() == 1.0
-    assert found.coverage <= 1.0
+    sums = add_up(ones, ones, 0.0, 2.0, 8)
+    assert sums.covered.max() == 1.0
+    assert sums.coverage <= 1.0
 
 
 # -- joints ----------------------------------------------------------------------------------------
@@ -85,16 +85,18 @@ def test_a_joint_that_lacks_a_factor_has_no_energy_of_that_kind():
         current={"b": 4.0, "c": 4.0},
         voltage={"a": 1.0, "c": 0.25},
     )
-    found = energy.joint_energies(SESSION, columns, (), SPAN, pytest.fail)
-    kinds = {name: (one.mechanical, one.electrical) for name, one in found.items()}
-    assert {name: [one is not None for one in both] for name, both in kinds.items()} == {
+    energies = energy.joint_energies(SESSION, columns, (), SPAN, pytest.fail)
+    kinds = {
+        name: (of_joint.mechanical, of_joint.electrical) for name, of_joint in energies.items()
+    }
+    assert {name: [kind is not None for kind in both] for name, both in kinds.items()} == {
         "a": [True, False],
         "b": [False, False],
         "c": [False, True],
     }
-    np.testing.assert_allclose(found["a"].mechanical.net_j, 0.5)
-    np.testing.assert_allclose(found["c"].electrical.net_j, 0.5)
-    sampled = [found[name].sampled for name in "abc"]
+    np.testing.assert_allclose(energies["a"].mechanical.net_j, 0.5)
+    np.testing.assert_allclose(energies["c"].electrical.net_j, 0.5)
+    sampled = [energies[name].sampled for name in "abc"]
     assert sampled == [{"mechanical"}, frozenset(), {"electrical"}]
 
 
@@ -104,13 +106,13 @@ def test_gaps_are_those_of_either_kind_beyond_a_hundredth(monkeypatch, kind):
     share = {"a": 0.99, "b": 0.9899, "c": 1.0}
 
     def of(name):
-        one = Energy(np.ones(2), np.ones(2), share[name], np.ones(2))
-        return Energies(**({"mechanical": None, "electrical": None} | {kind: one}))
+        part = Energy(np.ones(2), np.ones(2), share[name], np.ones(2))
+        return Energies(**({"mechanical": None, "electrical": None} | {kind: part}))
 
     monkeypatch.setattr(energy, "in_threads", lambda _job, names, *_: [of(name) for name in names])
-    said = []
-    energy.joint_energies(SESSION, columns, (), SPAN, said.append)
-    (text,) = said
+    warnings = []
+    energy.joint_energies(SESSION, columns, (), SPAN, warnings.append)
+    (text,) = warnings
     assert text.startswith("the power of b has gaps, which are not bridged: energies count only ")
 
 
@@ -134,16 +136,16 @@ def test_a_supply_varies_by_a_fifth_of_its_mean_at_most(sign, low, high, source)
     ],
 )
 def test_what_the_log_leaves_open_is_of_the_kinds_that_are_products(kinds, begins):
-    one = {"a": Energies(None, None, frozenset(kinds)), "b": Energies(None, None)}
-    said = []
+    by_joint = {"a": Energies(None, None, frozenset(kinds)), "b": Energies(None, None)}
+    warnings = []
     columns = columns_of(current={"a": 1.0}, voltage={"a": 5.0})
     session = SimpleNamespace(metadata={}, start_ns=ORIGIN_NS - 250_000_000)
     result = energy.energy_result(
-        session, columns, one, SPAN, transport=None, closure=None, warn=said.append
+        session, columns, by_joint, SPAN, transport=None, closure=None, warn=warnings.append
     )
     assert result.unknown.startswith(begins)
     assert (result.start_s, result.stop_s) == ((0.25, 0.75), (0.75, 1.25))
-    (text,) = said
+    (text,) = warnings
     assert text.startswith("/v stays as it is while the joints work, so it is the supply's")
 
 
@@ -172,16 +174,16 @@ def test_a_robot_at_rest_agrees_with_its_ledger():
 def test_a_way_counts_from_a_hundredth_of_the_length_in_each_cycle(ci95, way_m, nowhere):
     robot = SimpleNamespace(links=[SimpleNamespace(length=0.125)] * 2)
     way = np.full(4, way_m)
-    said = energy._goes_nowhere(way, Estimate(float(way.sum()), ci95), robot)
-    assert bool(said) is nowhere
+    note = energy._goes_nowhere(way, Estimate(float(way.sum()), ci95), robot)
+    assert bool(note) is nowhere
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_ratio_has_the_error_of_a_ratio_estimator(sign):
     """Cochran's var r = n / (n - 1) sum (a - r b)^2 / (sum b)^2, by hand; t is that of 2."""
     above, below = np.array([1.0, 2.0, 6.0]), sign * np.array([2.0, 3.0, 4.0])
-    found = energy._ratio(above, below)
+    ratio = energy._ratio(above, below)
     scatter = 1.0**2 + 1.0**2 + 2.0**2  # residuals -1, -1, 2 of the ratio +-1
     half = 4.302652729911275 * (1.5 * scatter) ** 0.5 / 9.0
-    assert found.value == pytest.approx(sign)
-    np.testing.assert_allclose(found.ci95, (sign - half, sign + half))
+    assert ratio.value == pytest.approx(sign)
+    np.testing.assert_allclose(ratio.ci95, (sign - half, sign + half))

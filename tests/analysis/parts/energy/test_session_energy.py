@@ -89,18 +89,22 @@ def written(tmp_path, robot):
                     booked.write(t_ns, np.array([T_S[k] * ledger[term] for term in LEDGER]))
             writer.set_verdict("good")
         opened.append(Session.open(path))
-        said = []
+        warnings = []
         session = opened[-1]
-        return session, read_columns(session, "/joint_commands", "/joint_states", said.append), said
+        return (
+            session,
+            read_columns(session, "/joint_commands", "/joint_states", warnings.append),
+            warnings,
+        )
 
     yield write
-    for one in opened:
-        one.close()
+    for log in opened:
+        log.close()
 
 
 def found_in(session, columns, artefacts=(), span=SPAN):
-    said = []
-    return energy.joint_energies(session, columns, artefacts, span, said.append), said
+    warnings = []
+    return energy.joint_energies(session, columns, artefacts, span, warnings.append), warnings
 
 
 def angles(count=T_S.size):
@@ -111,25 +115,27 @@ def angles(count=T_S.size):
 
 def test_each_joint_has_the_energies_of_its_own_samples_in_each_cycle(written):
     session, columns, _ = written()
-    found, said = found_in(session, columns)
-    assert (list(found), said) == (list(NAMES), [])
+    by_joint, warnings = found_in(session, columns)
+    assert (list(by_joint), warnings) == (list(NAMES), [])
     terms = {"net": "net", "plus": "plus", "abs": "abs", "el": "net", "el_clipped": "plus"}
     for term, part in terms.items():
         power = ELECTRICAL if term.startswith("el") else MECHANICAL
         for name, expected in zip(NAMES, by_hand(power, POSITIVE[part]), strict=True):
             # A sample's weight is half before and half after it: the jumps between cycles count.
-            np.testing.assert_allclose(found[name].per_cycle(term), expected, atol=0.03, rtol=0.02)
-    sums = energy.whole_robot(found.values())
+            np.testing.assert_allclose(
+                by_joint[name].per_cycle(term), expected, atol=0.03, rtol=0.02
+            )
+    sums = energy.whole_robot(by_joint.values())
     for term, part in terms.items():
-        whole = sum(one.per_cycle(term).sum() for one in found.values())
+        whole = sum(of_joint.per_cycle(term).sum() for of_joint in by_joint.values())
         assert sums[term] == pytest.approx(whole)
         assert part
-    clipped = sum(one.electrical.abs_j.sum() for one in found.values())
+    clipped = sum(of_joint.electrical.abs_j.sum() for of_joint in by_joint.values())
     assert sums["el_abs"] == pytest.approx(clipped)
-    assert all(one.sampled == {"mechanical", "electrical"} for one in found.values())
-    energies = energy.Energies(None, found["joint01"].electrical)
+    assert all(of_joint.sampled == {"mechanical", "electrical"} for of_joint in by_joint.values())
+    energies = energy.Energies(None, by_joint["joint01"].electrical)
     assert energies.per_cycle("net") is None
-    assert energies.per_cycle("el") is found["joint01"].electrical.net_j
+    assert energies.per_cycle("el") is by_joint["joint01"].electrical.net_j
     assert sorted(energy.whole_robot([energies])) == ["el", "el_abs", "el_clipped"]
 
 
@@ -142,14 +148,14 @@ def test_a_falsified_sensor_takes_its_own_kind_of_energy_of_its_own_joint(writte
         ("voltage", "electrical", "mechanical"),
     ):
         wrong = [Artefact("joint02", "/x", quantity, "wrong_unit", ())]
-        found, said = found_in(session, columns, wrong)
-        assert said == [f"joint02: {kind} energies are null, since a sensor falsifies them"]
-        assert getattr(found["joint02"], kind) is None
-        assert getattr(found["joint02"], other) is not None
-        assert found["joint02"].sampled == {other}
-        assert found["joint01"].sampled == {"mechanical", "electrical"}
-    kept, said = found_in(session, columns, [Artefact("joint02", "/x", "velocity", "gaps", ())])
-    assert said == []
+        by_joint, warnings = found_in(session, columns, wrong)
+        assert warnings == [f"joint02: {kind} energies are null, since a sensor falsifies them"]
+        assert getattr(by_joint["joint02"], kind) is None
+        assert getattr(by_joint["joint02"], other) is not None
+        assert by_joint["joint02"].sampled == {other}
+        assert by_joint["joint01"].sampled == {"mechanical", "electrical"}
+    kept, warnings = found_in(session, columns, [Artefact("joint02", "/x", "velocity", "gaps", ())])
+    assert warnings == []
     assert kept["joint02"].mechanical is not None
 
 
@@ -158,24 +164,24 @@ def test_accumulated_powers_come_before_products_where_both_parts_are_there(writ
     positive = np.maximum(mean, 0.0) + 0.5
     topics = [(PowerTopic.MECHANICAL, mean), (PowerTopic.MECHANICAL_PLUS, positive[:, :1])]
     session, columns, _ = written(motor=False, powers=topics)
-    found, _ = found_in(session, columns)
-    np.testing.assert_allclose(found["joint01"].per_cycle("net"), 4.0)
-    np.testing.assert_allclose(found["joint01"].per_cycle("plus"), 5.0)
-    np.testing.assert_allclose(found["joint01"].per_cycle("abs"), 6.0)
-    assert found["joint01"].sampled == frozenset()
+    by_joint, _ = found_in(session, columns)
+    np.testing.assert_allclose(by_joint["joint01"].per_cycle("net"), 4.0)
+    np.testing.assert_allclose(by_joint["joint01"].per_cycle("plus"), 5.0)
+    np.testing.assert_allclose(by_joint["joint01"].per_cycle("abs"), 6.0)
+    assert by_joint["joint01"].sampled == frozenset()
     # The second joint lacks the positive part: a product, from its torque and velocity.
     expected = by_hand(MECHANICAL)[1]
-    np.testing.assert_allclose(found["joint02"].per_cycle("net"), expected, atol=0.03)
-    assert found["joint02"].sampled == {"mechanical"}
-    assert found["joint01"].electrical is found["joint02"].electrical is None
+    np.testing.assert_allclose(by_joint["joint02"].per_cycle("net"), expected, atol=0.03)
+    assert by_joint["joint02"].sampled == {"mechanical"}
+    assert by_joint["joint01"].electrical is by_joint["joint02"].electrical is None
 
 
 def test_gaps_are_told_by_name(written):
     session, columns, _ = written()
     wide = dataclasses.replace(SPAN, stop_s=11.0)  # the samples end at 10 s
-    found, said = found_in(session, columns, span=wide)
-    assert found["joint01"].mechanical.coverage == pytest.approx(0.9, abs=0.002)
-    (text,) = said
+    by_joint, warnings = found_in(session, columns, span=wide)
+    assert by_joint["joint01"].mechanical.coverage == pytest.approx(0.9, abs=0.002)
+    (text,) = warnings
     assert text.startswith("the power of joint01, joint02 has gaps")
     barely = dataclasses.replace(SPAN, stop_s=10.0 + 0.9 * energy.GAP_SHARE * 9.0)
     assert found_in(session, columns, span=barely)[1] == []
@@ -205,30 +211,30 @@ def test_a_voltage_that_stays_is_the_supplys(volts, source, written):
 
 def test_the_result_has_each_cycle_from_the_sessions_start(written):
     session, columns, _ = written(scenario="x.toml")
-    found, _ = found_in(session, columns)
-    said = []
-    cost = energy.transport(session, angles(), found, SPAN, said.append)
+    by_joint, _ = found_in(session, columns)
+    warnings = []
+    cost = energy.transport(session, angles(), by_joint, SPAN, warnings.append)
     later = dataclasses.replace(SPAN, origin_ns=EPOCH_NS + 500_000_000)
     result = energy.energy_result(
-        session, columns, found, later, transport=cost, closure=None, warn=said.append
+        session, columns, by_joint, later, transport=cost, closure=None, warn=warnings.append
     )
     assert result.start_s == (1.5, 3.5, 5.5, 7.5)
     assert result.stop_s == (3.5, 5.5, 7.5, 9.5)
     assert result.electrical == "simulated"
-    assert said == []
+    assert warnings == []
     assert [joint.name for joint in result.joints] == list(NAMES)
     first = result.joints[0]
-    assert first.net_j == tuple(found["joint01"].mechanical.net_j)
-    assert first.el_clipped_j == tuple(found["joint01"].electrical.plus_j)
-    assert first.coverage == tuple(found["joint01"].mechanical.covered)
-    assert first.el_coverage == tuple(found["joint01"].electrical.covered)
+    assert first.net_j == tuple(by_joint["joint01"].mechanical.net_j)
+    assert first.el_clipped_j == tuple(by_joint["joint01"].electrical.plus_j)
+    assert first.coverage == tuple(by_joint["joint01"].mechanical.covered)
+    assert first.el_coverage == tuple(by_joint["joint01"].electrical.covered)
     assert result.unknown.startswith(
         "mechanical energies are products of sampled torque and velocity and electrical energies "
         "are products of sampled voltage and current: "
     )
     none = {name: energy.Energies(None, None) for name in NAMES}
     bare = energy.energy_result(
-        session, columns, none, SPAN, transport=cost, closure=None, warn=said.append
+        session, columns, none, SPAN, transport=cost, closure=None, warn=warnings.append
     )
     assert (bare.unknown, bare.joints[0].net_j, bare.joints[0].coverage) == (None, None, None)
     assert bare.joints[0].el_coverage is None
@@ -238,32 +244,32 @@ def test_without_a_gait_the_window_is_one_cycle(written):
     session, columns, _ = written()
     cycles, _ = found_in(session, columns)
     still = dataclasses.replace(SPAN, cycles=0)
-    found, said = found_in(session, columns, span=still)
+    by_joint, warnings = found_in(session, columns, span=still)
     for name in NAMES:
         for term in energy.TERMS:
-            (whole,) = found[name].per_cycle(term)
+            (whole,) = by_joint[name].per_cycle(term)
             assert whole == pytest.approx(cycles[name].per_cycle(term).sum())
-    cost = energy.transport(session, angles(), cycles, SPAN, said.append)
+    cost = energy.transport(session, angles(), cycles, SPAN, warnings.append)
     result = energy.energy_result(
-        session, columns, found, still, transport=cost, closure=None, warn=said.append
+        session, columns, by_joint, still, transport=cost, closure=None, warn=warnings.append
     )
-    assert (result.start_s, result.stop_s, said) == ((1.0,), (9.0,), [])
+    assert (result.start_s, result.stop_s, warnings) == ((1.0,), (9.0,), [])
 
 
 def test_the_ledger_is_compared_over_the_same_window(written):
     session, columns, _ = written()
-    found, _ = found_in(session, columns)
-    assert energy.check_ledger(session, found.values(), SPAN, pytest.fail) is None
-    sums = energy.whole_robot(found.values())
+    by_joint, _ = found_in(session, columns)
+    assert energy.check_ledger(session, by_joint.values(), SPAN, pytest.fail) is None
+    sums = energy.whole_robot(by_joint.values())
     rates = {"mechanical_net": sums["net"] / 8.0, "mechanical_plus": (sums["plus"] - 0.4) / 8.0}
     rates |= {"mechanical_abs": sums["abs"] / 8.0, "mechanical_residual": 0.01}
     session, columns, _ = written(ledger=rates)
     assert energy.booked_energies(session, SPAN) == pytest.approx(
         {name: 8.0 * rate for name, rate in rates.items()}
     )
-    said = []
-    closure = energy.check_ledger(session, found.values(), SPAN, said.append)
-    assert said == []
+    warnings = []
+    closure = energy.check_ledger(session, by_joint.values(), SPAN, warnings.append)
+    assert warnings == []
     assert closure.mechanical_balance == pytest.approx(0.08 / sums["abs"])
     assert closure.plus == pytest.approx(0.4 / sums["abs"])
     assert (closure.net, closure.abs) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -275,31 +281,31 @@ def test_the_ledger_is_compared_over_the_same_window(written):
 @pytest.mark.parametrize(("share", "warned"), [(0.04, False), (0.06, True), (-0.06, True)])
 def test_a_ledger_that_says_otherwise_is_told(share, warned, written):
     session, columns, _ = written()
-    found, _ = found_in(session, columns)
-    sums = energy.whole_robot(found.values())
+    by_joint, _ = found_in(session, columns)
+    sums = energy.whole_robot(by_joint.values())
     rates = dict.fromkeys(LEDGER, 0.0)
     rates["mechanical_net"] = (sums["net"] + share * sums["abs"]) / 8.0
     rates["mechanical_abs"] = sums["abs"] / 8.0
     session, columns, _ = written(ledger=rates)
-    said = []
-    closure = energy.check_ledger(session, found.values(), SPAN, said.append)
+    warnings = []
+    closure = energy.check_ledger(session, by_joint.values(), SPAN, warnings.append)
     assert closure.net == pytest.approx(-share, abs=1e-6)
-    assert [text.split(" is ")[0] for text in said] == ["mechanical energy"] * warned
+    assert [text.split(" is ")[0] for text in warnings] == ["mechanical energy"] * warned
 
 
 def test_the_cost_of_transport_is_energy_over_weight_and_way(written, robot):
     session, columns, _ = written()
-    found, _ = found_in(session, columns)
-    said = []
-    cost = energy.transport(session, angles(), found, SPAN, said.append)
-    assert (said, cost.why) == ([], "")
+    by_joint, _ = found_in(session, columns)
+    warnings = []
+    cost = energy.transport(session, angles(), by_joint, SPAN, warnings.append)
+    assert (warnings, cost.why) == ([], "")
     assert cost.mass_kg == pytest.approx(robot.total_mass)
     assert cost.distance_m.value == pytest.approx(FORWARD_M.sum(), rel=1e-6)
     low, high = stats.t.interval(0.95, CYCLES - 1, FORWARD_M.mean(), stats.sem(FORWARD_M))
     np.testing.assert_allclose(cost.distance_m.ci95, (CYCLES * low, CYCLES * high), rtol=1e-6)
     weight = robot.total_mass * GRAVITY
     for term in ("net", "plus", "abs", "el", "el_clipped"):
-        above = sum(one.per_cycle(term) for one in found.values())
+        above = sum(of_joint.per_cycle(term) for of_joint in by_joint.values())
         ratio = above.sum() / (weight * FORWARD_M.sum())
         assert getattr(cost, term).value == pytest.approx(ratio, rel=1e-6)
         rest = above - ratio * weight * FORWARD_M
@@ -309,19 +315,19 @@ def test_the_cost_of_transport_is_energy_over_weight_and_way(written, robot):
 
 def test_a_cost_that_lacks_something_says_what(written):
     session, columns, _ = written(motor=False)
-    found, _ = found_in(session, columns)
-    said = []
-    cost = energy.transport(session, angles(), found, SPAN, said.append)
+    by_joint, _ = found_in(session, columns)
+    warnings = []
+    cost = energy.transport(session, angles(), by_joint, SPAN, warnings.append)
     assert cost.why == "no electrical energy of some joints"
-    assert [str(text) for text in said] == [f"cost of transport is partly null: {cost.why}"]
+    assert [str(text) for text in warnings] == [f"cost of transport is partly null: {cost.why}"]
     assert cost.net.value is not None
     assert cost.el.value is cost.el_clipped.value is None
-    some = {**found, "joint02": energy.Energies(None, None)}
-    cost = energy.transport(session, angles(), some, SPAN, said.append)
+    some = {**by_joint, "joint02": energy.Energies(None, None)}
+    cost = energy.transport(session, angles(), some, SPAN, warnings.append)
     assert cost.why == "no mechanical energy of some joints; no electrical energy of some joints"
     assert cost.net.value is None
     still, columns, _ = written(way=False)
-    cost = energy.transport(still, angles(), found, SPAN, said.append)
+    cost = energy.transport(still, angles(), by_joint, SPAN, warnings.append)
     assert cost.distance_m.value is cost.net.value is None
     assert "no cost of transport" not in cost.why
     assert cost.why.startswith("it takes a robot description")
@@ -329,7 +335,7 @@ def test_a_cost_that_lacks_something_says_what(written):
 
 def test_a_robot_that_goes_nowhere_has_no_cost(written, robot, monkeypatch):
     session, columns, _ = written()
-    found, _ = found_in(session, columns)
+    by_joint, _ = found_in(session, columns)
     way = np.array([0.001, -0.0011, 0.001, 0.0])
     least = energy.LEAST_WAY * sum(link.length for link in robot.links) * CYCLES
     assert energy._goes_nowhere(way, energy._distance(way), robot) == [
@@ -341,11 +347,11 @@ def test_a_robot_that_goes_nowhere_has_no_cost(written, robot, monkeypatch):
     scattered = np.array([0.1, -0.05, 0.09, -0.06])  # far enough, but it may be chance
     assert energy._goes_nowhere(scattered, energy._distance(scattered), robot)
     monkeypatch.setattr(energy, "LEAST_WAY", 10.0)
-    said = []
-    cost = energy.transport(session, angles(), found, SPAN, said.append)
+    warnings = []
+    cost = energy.transport(session, angles(), by_joint, SPAN, warnings.append)
     assert cost.why.startswith("the centre of mass moves by 410 mm in 4 cycles")
     assert cost.distance_m.value == pytest.approx(0.41)
-    assert [str(text) for text in said] == [f"cost of transport is not applicable: {cost.why}"]
+    assert [str(text) for text in warnings] == [f"cost of transport is not applicable: {cost.why}"]
 
 
 def test_what_is_handed_on_can_not_be_changed():

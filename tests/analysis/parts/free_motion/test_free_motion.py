@@ -20,19 +20,19 @@ NOISE = 0.01
 def chain(amplitudes, seconds=12.0, rate=50.0, noise=0.0, seed=0):
     """Series of joints, each on its own irregular times, about the middle of the record."""
     random = np.random.default_rng(seed)
-    found = {}
+    channels = {}
     for k, amplitude in enumerate(amplitudes):
         t = np.arange(-seconds / 2, seconds / 2, 1 / rate) + random.uniform(0, 0.3 / rate)
         t = t + random.uniform(0, 0.3 / rate, t.size)
         values = np.real(amplitude * np.exp(1j * OMEGA * t)) + 0.1 * k
         name = f"joint{k + 1:02d}"
-        found[name] = Series(name, t, values + noise * random.standard_normal(t.size))
-    return found
+        channels[name] = Series(name, t, values + noise * random.standard_normal(t.size))
+    return channels
 
 
 def measured(series, robot=None):
-    one = next(iter(series.values()))
-    gait = fit_gait({}, series, float(np.ptp(one.t_s)), lambda _: None)
+    channel = next(iter(series.values()))
+    gait = fit_gait({}, series, float(np.ptp(channel.t_s)), lambda _: None)
     return gait, free_motion(robot, fit_motion(series, gait))[0]
 
 

@@ -21,16 +21,16 @@ def motion():
 @pytest.mark.parametrize("cycles", motion_tables.CYCLES)
 def test_intervals_of_the_twin_hold_its_motion_without_noise(motion, cycles):
     """95 % of 200 draws within binomial scatter, no wider than 1.1 times the Cramer-Rao bound."""
-    found = motion_tables.coverage(motion, cycles, 200)
-    assert all(0.91 <= share <= 0.98 for share in found.inside.values()), found
-    assert all(width < 1.1 for width in found.width.values()), found
+    coverage = motion_tables.coverage(motion, cycles, 200)
+    assert all(0.91 <= share <= 0.98 for share in coverage.inside.values()), coverage
+    assert all(width < 1.1 for width in coverage.width.values()), coverage
 
 
 def test_the_record_decides_no_end_and_the_note_says_so(motion_without_robot, command):
     result = json.loads(command("analyse", motion_without_robot, "--json").out)
     (wave,) = result["free_motion"]["waves"]
     assert wave["direction"] == "first-to-last"
-    (note,) = [one for one in result["notes"] if "head is unknown" in one]
+    (note,) = [text for text in result["notes"] if "head is unknown" in text]
     assert "directions are relative to that order" in note
     assert "directions are relative to that order" in " ".join(
         command("analyse", motion_without_robot).out.split()

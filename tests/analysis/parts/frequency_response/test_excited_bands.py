@@ -82,11 +82,11 @@ def test_nothing_is_given_outside_of_a_sweep(rising):
     assert 0.1 <= low < 0.2
     assert 2.6 < high <= 2.77
     y = signal.lfilter([0.2], [1, -0.8], u) + 1e-3 * RNG.normal(size=t.size)
-    (found,) = frequency_responses({"a": series(u, t)}, {"a": series(y, t)}, pytest.fail)
-    assert found.excitation == "chirp"
-    assert found.frequency_hz[0] >= 0.1
-    assert found.frequency_hz[-1] <= 2.77
-    assert found.frequency_hz[-1] > 2.5
+    (response,) = frequency_responses({"a": series(u, t)}, {"a": series(y, t)}, pytest.fail)
+    assert response.excitation == "chirp"
+    assert response.frequency_hz[0] >= 0.1
+    assert response.frequency_hz[-1] <= 2.77
+    assert response.frequency_hz[-1] > 2.5
 
 
 def test_a_move_of_a_few_bins_has_no_line():

@@ -59,22 +59,22 @@ def test_the_response_of_a_known_servo_lies_within_its_intervals(kind, command, 
     u = command(t, rng)
     y = responded(u, t) + 0.002 * rng.normal(size=t.size)
     result = write(tmp_path / "a.mcap", ["joint01"], (t, u[:, None]), (t, y[:, None]))
-    (found,) = result.frequency_response
-    assert found.excitation == kind
-    f = np.array(found.frequency_hz)
+    (response,) = result.frequency_response
+    assert response.excitation == kind
+    f = np.array(response.frequency_hz)
     _, exact = signal.freqresp(SERVO, 2 * np.pi * f)
     exact = exact * np.sinc(f * STEP_S) ** 2  # a line from sample to sample, as lsim has it
-    low, high = np.array(found.gain_ci95).T
-    sure = np.array([one is not None for one in found.lag_ci95])  # others are noise
+    low, high = np.array(response.gain_ci95).T
+    sure = np.array([interval is not None for interval in response.lag_ci95])  # others are noise
     assert sure.sum() >= 3
     assert np.mean(((low <= np.abs(exact)) & (np.abs(exact) <= high))[sure]) >= 0.85
     assert "frequency response" in result.answer.sentence
     assert json.loads(json.dumps(result.to_dict()))["frequency_response"][0]["joint"] == "joint01"
     if kind in ("steps", "broadband"):  # with power beyond the bandwidth
-        assert found.bandwidth_hz == pytest.approx(25.0 * 1.27 / 2 / np.pi, rel=0.05)
+        assert response.bandwidth_hz == pytest.approx(25.0 * 1.27 / 2 / np.pi, rel=0.05)
     if kind != "sum of sines":  # three lines have no model
-        assert found.delay_model is not None
-        low, high = found.delay_s.ci95
+        assert response.delay_model is not None
+        low, high = response.delay_s.ci95
         assert low <= DELAY_S <= high + 5e-4  # a twentieth of a sample: splines near their limit
 
 
@@ -98,13 +98,13 @@ def test_the_halves_of_an_arms_multisine_agree(tmp_path):
         columns(folder / "state_motor.csv", "positions"),
     )
     result = write(tmp_path / "a.mcap", names, commands, states)
-    found = {one.joint: one for one in result.frequency_response}
-    assert list(found) == names
-    agree, lines = np.sum([one.halves_agree for one in found.values()], axis=0)
+    responses = {response.joint: response for response in result.frequency_response}
+    assert list(responses) == names
+    agree, lines = np.sum([response.halves_agree for response in responses.values()], axis=0)
     assert lines == 24
     assert 22 <= agree <= 23, "91 to 98 %"
-    assert found["Rotation"].gain[0] == pytest.approx(1.0, abs=0.03)
-    assert all(one.gain[0] > one.gain[-1] for one in found.values())
+    assert responses["Rotation"].gain[0] == pytest.approx(1.0, abs=0.03)
+    assert all(response.gain[0] > response.gain[-1] for response in responses.values())
 
 
 def halves_of(command, response):
@@ -127,7 +127,7 @@ def test_intervals_of_an_arms_multisine_are_as_wide_as_its_halves_differ():
     difference, half = [], []
     for k, name in enumerate(names):
         pair = [Series(name, *unrepeated(t - start, values[:, k])) for t, values in recorded]
-        first, second = halves_of(*(one.between(0.0, stop - start) for one in pair))
+        first, second = halves_of(*(series.between(0.0, stop - start) for series in pair))
         freedom = first.freedom + second.freedom
         quantile = stats.f.ppf(0.95, 2, 2 * freedom)
         difference.append(np.abs(first.value - second.value))
@@ -155,11 +155,11 @@ def left_out(y, u, bins):
         design = np.hstack([u[index, None] / np.abs(u[index]).mean() * powers, powers])
         rest = index != k
         inverse = np.linalg.pinv(design[rest])
-        found = inverse @ y[index[rest]]
+        coefficients = inverse @ y[index[rest]]
         freedom = rest.sum() - design.shape[1]
-        noise = np.sum(np.abs(y[index[rest]] - design[rest] @ found) ** 2) / freedom
+        noise = np.sum(np.abs(y[index[rest]] - design[rest] @ coefficients) ** 2) / freedom
         spread = 1 + np.linalg.norm(design[half] @ inverse) ** 2
-        errors.append((y[k] - design[half] @ found) / np.sqrt(noise * spread))
+        errors.append((y[k] - design[half] @ coefficients) / np.sqrt(noise * spread))
     return np.array(errors), freedom
 
 
@@ -189,9 +189,9 @@ def test_each_bin_of_a_quadrupeds_chirp_is_predicted_by_the_others():
             for values in (command, position)
         ]
         times = np.arange(t[0], t[-1], pair[0].period_s)
-        asked, measured = (resampled(one, times) - one.values.mean() for one in pair)
+        asked, measured = (resampled(series, times) - series.values.mean() for series in pair)
         linear = signal.lsim(SERVO, asked, times)[1] + rng.normal(0, 0.005, times.size)
-        u, y, truth = (np.fft.rfft(one) for one in (asked, measured, linear))
+        u, y, truth = (np.fft.rfft(samples) for samples in (asked, measured, linear))
         bins = excited_bins(np.abs(u) ** 2)
         bins = bins[bins > window(1, freedom=12)]
         errors, freedom = left_out(y, u, bins)
@@ -218,11 +218,11 @@ def test_a_quadrupeds_chirp_is_one_input(tmp_path):
     states, commands = position.reshape(-1, 12), command.reshape(-1, 12)
     result = write(tmp_path / "a.mcap", names, (t, commands), (t, states))
     assert len(result.frequency_response) == 12
-    for one in result.frequency_response:
-        assert one.excitation == "chirp"
-        assert len(one.shares_command) == 11
-        assert one.halves_agree is None
-        assert one.distortion is None
+    for response in result.frequency_response:
+        assert response.excitation == "chirp"
+        assert len(response.shares_command) == 11
+        assert response.halves_agree is None
+        assert response.distortion is None
     assert "All joints share one command" in result.answer.sentence
 
 
@@ -231,10 +231,10 @@ def test_a_servo_of_a_snake_follows_with_the_lag_of_its_ramp(tmp_path, command):
     session = tmp_path / "ramp.mcap"
     command("import", TRACE, "-o", session, "--robot", "arcsnake-joint")
     with Session.open(session) as opened:
-        (found,) = analyse_session(opened, Options(start_s=3.0, stop_s=10.5)).frequency_response
+        (response,) = analyse_session(opened, Options(start_s=3.0, stop_s=10.5)).frequency_response
     # Fitted in the time domain: position = 1.000 command(t - 7.4 ms) + offset.
-    assert found.gain_ci95[0][0] <= 1.0 <= found.gain_ci95[0][1]
-    assert found.delay_s.ci95[0] <= 7.4e-3 <= found.delay_s.ci95[1]
+    assert response.gain_ci95[0][0] <= 1.0 <= response.gain_ci95[0][1]
+    assert response.delay_s.ci95[0] <= 7.4e-3 <= response.delay_s.ci95[1]
 
 
 @pytest.mark.parametrize("planted", [0.0, 0.01])
@@ -248,8 +248,10 @@ def test_distortion_of_a_period_between_two_samples_is_that_which_was_planted(pl
     turns = np.exp(2j * np.pi * np.outer(t, lines) / period_s + 1j * phase)
     u, y = 0.05 * turns.real.sum(axis=1), 0.05 * (turns @ gain).real
     y += planted * np.cos(2 * np.pi * 6 * t / period_s)
-    (found,) = frequency_responses({"a": Series("a", t, u)}, {"a": Series("a", t, y)}, pytest.fail)
+    (response,) = frequency_responses(
+        {"a": Series("a", t, u)}, {"a": Series("a", t, y)}, pytest.fail
+    )
     power = np.mean(0.05**2 * np.abs(gain) ** 2)
     truth = np.sqrt(planted**2 / free.size / power)
-    assert found.excitation == "periodic multisine"
-    assert found.distortion == pytest.approx(truth, rel=0.02, abs=2e-3)
+    assert response.excitation == "periodic multisine"
+    assert response.distortion == pytest.approx(truth, rel=0.02, abs=2e-3)

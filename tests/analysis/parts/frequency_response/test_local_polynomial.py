@@ -21,9 +21,9 @@ def test_intervals_hold_the_exact_response_in_spite_of_leakage():
     for _ in range(100):
         u = rng.normal(size=N)
         y = signal.lfilter(*FILTERS[0], u) + 0.05 * rng.normal(size=N)
-        found = local_response(np.fft.rfft(y), np.fft.rfft(u)[None], BINS, window(1))
-        inside.append(np.abs(found.value[:, 0] - truth(0)) <= found.radius()[:, 0])
-        noise.append(found.noise)
+        local = local_response(np.fft.rfft(y), np.fft.rfft(u)[None], BINS, window(1))
+        inside.append(np.abs(local.value[:, 0] - truth(0)) <= local.radius()[:, 0])
+        noise.append(local.noise)
     assert 0.93 <= np.mean(inside) <= 0.97
     assert np.mean(noise) == pytest.approx(N * 0.05**2, rel=0.05)
 
@@ -32,19 +32,19 @@ def test_several_inputs_are_told_apart():
     rng, inside = np.random.default_rng(1), []
     for _ in range(60):
         u = rng.normal(size=(2, N))
-        y = sum(signal.lfilter(*f, one) for f, one in zip(FILTERS, u, strict=True))
+        y = sum(signal.lfilter(*f, samples) for f, samples in zip(FILTERS, u, strict=True))
         y += 0.05 * rng.normal(size=N)
-        found = local_response(np.fft.rfft(y), np.fft.rfft(u), BINS, window(2))
+        local = local_response(np.fft.rfft(y), np.fft.rfft(u), BINS, window(2))
         exact = np.stack([truth(0), truth(1)], axis=1)
-        inside.append(np.abs(found.value - exact) <= found.radius())
+        inside.append(np.abs(local.value - exact) <= local.radius())
     assert 0.92 <= np.mean(inside) <= 0.98
 
 
 def test_inputs_that_are_one_have_no_response_of_their_own():
     rng = np.random.default_rng(2)
     u = np.fft.rfft(rng.normal(size=N))
-    found = local_response(u, np.stack([u, -2 * u]), BINS, window(2))
-    assert np.isnan(found.value).all()
+    local = local_response(u, np.stack([u, -2 * u]), BINS, window(2))
+    assert np.isnan(local.value).all()
 
 
 @pytest.mark.parametrize("half", [2, N])

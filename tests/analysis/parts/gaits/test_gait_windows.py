@@ -90,8 +90,8 @@ def test_a_weak_joint_is_named_over_all_gaits(tmp_path, change):
     gains[3] = 0.55
     answer = analysed(write(tmp_path / "a.mcap", gains=gains, **CHANGES[change])).answer
     assert answer.sentence.startswith("j3 "), answer.sentence
-    names = {found.joint for found in (*answer.stand_out, *answer.apart)}
-    assert names | {found.joint for found in answer.not_following} == {"j3"}
+    names = {difference.joint for difference in (*answer.stand_out, *answer.apart)}
+    assert names | {fault.joint for fault in answer.not_following} == {"j3"}
 
 
 def test_a_difference_lost_in_one_gait_is_found_over_all(tmp_path):
@@ -99,9 +99,9 @@ def test_a_difference_lost_in_one_gait_is_found_over_all(tmp_path):
     gains[5] = 0.95 * 1.05
     pace = stepped(0.5, 0.9, 30.0)
     answer = analysed(write(tmp_path / "a.mcap", gains=gains, noise=0.05, pace_hz=pace)).answer
-    (found,) = answer.stand_out
-    assert (found.joint, found.quantity) == ("j5", "gain")
-    assert found.ci95[0] <= 0.05 <= found.ci95[1]
+    (difference,) = answer.stand_out
+    assert (difference.joint, difference.quantity) == ("j5", "gain")
+    assert difference.ci95[0] <= 0.05 <= difference.ci95[1]
 
 
 @pytest.mark.parametrize(

@@ -87,10 +87,10 @@ def test_a_session_of_the_twin_states_its_contact_and_how_often_that_is_right(tm
     assert contact["source"] == "effort"
     assert contact["twin_accuracy"] == list(TWIN_ACCURACY)
     assert len(contact["links"]) == 13
-    shares = [one["share"] for one in contact["links"]]
+    shares = [link["share"] for link in contact["links"]]
     assert 0.2 < np.mean(shares) < 0.5
-    assert all(one["share_ci95"][0] <= one["share"] for one in contact["links"])
-    np.testing.assert_allclose([np.mean(one["by_phase"]) for one in contact["links"]], shares)
+    assert all(link["share_ci95"][0] <= link["share"] for link in contact["links"])
+    np.testing.assert_allclose([np.mean(link["by_phase"]) for link in contact["links"]], shares)
     assert "chance: 50 %" in " ".join(command("analyse", path).out.split())
 
 
@@ -114,8 +114,8 @@ def test_efforts_of_another_sign_or_unit_give_no_contact(tmp_path, command):
 
     assert result(run.effort)["ground_contact"]["source"] == "effort"
     for factor, why in ((-1.0, ["the other sign"]), (100.0, ["no loads of links"]), (0.0, [])):
-        found = result(factor * run.effort)
-        assert found["ground_contact"] is None
-        notes = [one for one in found["notes"] if "no ground contact" in one]
+        measured = result(factor * run.effort)
+        assert measured["ground_contact"] is None
+        notes = [note for note in measured["notes"] if "no ground contact" in note]
         assert len(notes) == len(why)
         assert all(part in note for part, note in zip(why, notes, strict=True))

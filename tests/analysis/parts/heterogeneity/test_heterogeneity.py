@@ -31,8 +31,8 @@ def trials(gain, lag, noise, runs=150, seed=1):
     return [response_indices(measured(rng, gain, lag, noise)) for _ in range(runs)]
 
 
-def covers(found, name, truth):
-    low, high = np.transpose([indices[name].ci95 for indices in found])
+def covers(draws, name, truth):
+    low, high = np.transpose([indices[name].ci95 for indices in draws])
     return np.mean((low <= truth) & (truth <= high))
 
 
@@ -40,14 +40,14 @@ UNEQUAL = np.linspace(0.006, 0.014, 13)
 
 
 def test_identical_joints():
-    found = trials(np.full(13, 0.95), np.full(13, 0.2), UNEQUAL)
+    draws = trials(np.full(13, 0.95), np.full(13, 0.2), UNEQUAL)
     for name in ("common_response", "gain_cv", "lag_sd", "boundary_contrast_lag"):
         # 150 tests at 5 %: standard error 1.8 %.
-        assert 0.005 < np.mean([indices[name].p < 0.05 for indices in found]) < 0.105
+        assert 0.005 < np.mean([indices[name].p < 0.05 for indices in draws]) < 0.105
     # Without the correction the CV would be 0.01 on average.
-    assert np.mean([indices["gain_cv"].value for indices in found]) < 0.004
-    assert np.mean([indices["gain_cv"].ci95[0] == 0 for indices in found]) > 0.95
-    assert 0.9 < covers(found, "boundary_contrast_gain", 0.0) < 0.99
+    assert np.mean([indices["gain_cv"].value for indices in draws]) < 0.004
+    assert np.mean([indices["gain_cv"].ci95[0] == 0 for indices in draws]) > 0.95
+    assert 0.9 < covers(draws, "boundary_contrast_gain", 0.0) < 0.99
 
 
 @pytest.mark.parametrize("size", [0.01, 0.05])
@@ -55,33 +55,33 @@ def test_unlike_joints(size):
     rng = np.random.default_rng(2)
     gain = 0.95 * (1 + size * rng.normal(size=13))
     lag = 0.2 + size * rng.normal(size=13)
-    found = trials(gain, lag, UNEQUAL)
+    draws = trials(gain, lag, UNEQUAL)
     # Noise is taken as equal over the joints: generous where the odd joint is a quiet one.
-    assert covers(found, "gain_cv", gain.std() / gain.mean()) > 0.91
-    assert covers(found, "lag_sd", lag.std()) > 0.91
+    assert covers(draws, "gain_cv", gain.std() / gain.mean()) > 0.91
+    assert covers(draws, "lag_sd", lag.std()) > 0.91
     contrast = (lag[0] + lag[-1]) / 2 - lag[4:9].mean()
-    assert 0.9 < covers(found, "boundary_contrast_lag", contrast) < 0.99
-    mean = np.mean([indices["gain_cv"].value for indices in found])
+    assert 0.9 < covers(draws, "boundary_contrast_lag", contrast) < 0.99
+    mean = np.mean([indices["gain_cv"].value for indices in draws])
     assert mean == pytest.approx(gain.std() / gain.mean(), rel=0.15)
 
 
 def test_exact_measurements_give_exact_indices():
     gain, lag = np.linspace(0.9, 1.1, 7), np.linspace(0.1, 0.3, 7)
     exact = Response(gain * np.exp(-1j * lag), *np.full((2, 7), 1e-20), np.full(7, 8.0))
-    found = response_indices(exact)
-    assert found["gain_cv"].value == pytest.approx(gain.std() / gain.mean(), rel=1e-9)
+    indices = response_indices(exact)
+    assert indices["gain_cv"].value == pytest.approx(gain.std() / gain.mean(), rel=1e-9)
     # For a small spread the circular standard deviation is the ordinary one.
-    assert found["lag_sd"].value == pytest.approx(lag.std(), rel=2e-3)
-    assert found["lag_sd"].ci95 == pytest.approx((lag.std(), lag.std()), rel=2e-3)
-    assert found["common_response"].p < 1e-12
-    assert found["boundary_contrast_lag"].value == pytest.approx(0.0, abs=1e-12)
+    assert indices["lag_sd"].value == pytest.approx(lag.std(), rel=2e-3)
+    assert indices["lag_sd"].ci95 == pytest.approx((lag.std(), lag.std()), rel=2e-3)
+    assert indices["common_response"].p < 1e-12
+    assert indices["boundary_contrast_lag"].value == pytest.approx(0.0, abs=1e-12)
 
 
 def test_circular_sd_does_not_break_at_pi():
     lag = np.pi + np.array([-0.1, 0.0, 0.1, 0.05])
     here, there = (
-        response_indices(Response(np.exp(-1j * one), *np.full((2, 4), 1e-12), np.full(4, 8.0)))
-        for one in (lag, lag - 1)
+        response_indices(Response(np.exp(-1j * phases), *np.full((2, 4), 1e-12), np.full(4, 8.0)))
+        for phases in (lag, lag - 1)
     )
     assert here["lag_sd"].value == pytest.approx(there["lag_sd"].value, rel=1e-9)
     assert "boundary_contrast_lag" not in here  # four joints have no middle five
@@ -106,9 +106,9 @@ def test_gini_and_cv_of_energies():
     pairs = np.abs(values[:, None] - values[None, :]).mean() / (2 * values.mean())
     assert gini(values) == pytest.approx(pairs)
     cycles = np.outer(values, np.ones(6))
-    found = energy_indices(cycles)
-    assert found["energy_cv"].value == pytest.approx(values.std() / values.mean())
-    assert found["energy_gini"].ci95 == pytest.approx((gini(values), gini(values)))
+    indices = energy_indices(cycles)
+    assert indices["energy_cv"].value == pytest.approx(values.std() / values.mean())
+    assert indices["energy_gini"].ci95 == pytest.approx((gini(values), gini(values)))
     assert energy_indices(cycles[:, :2])["energy_cv"].ci95 is None
     assert energy_indices(cycles[:1]) == {}
 
@@ -117,8 +117,8 @@ def test_energy_intervals_cover():
     rng = np.random.default_rng(4)
     level = np.linspace(1.0, 2.0, 13)
     truth = level.std() / level.mean()
-    found = [energy_indices(level[:, None] * rng.normal(1, 0.05, (13, 8))) for _ in range(400)]
-    assert 0.9 < covers(found, "energy_cv", truth) < 0.99
+    draws = [energy_indices(level[:, None] * rng.normal(1, 0.05, (13, 8))) for _ in range(400)]
+    assert 0.9 < covers(draws, "energy_cv", truth) < 0.99
 
 
 def test_fewer_than_two_joints_have_no_spread():

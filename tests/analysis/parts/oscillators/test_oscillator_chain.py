@@ -30,15 +30,15 @@ class Planted:
 
     def flow(self, rng, kicks, every_s, kick):
         """Phases without noise, by SciPy."""
-        state, found = rng.uniform(-1.0, 1.0, self.n), []
+        state, phases = rng.uniform(-1.0, 1.0, self.n), []
         times = np.arange(round(every_s / PERIOD_S) + 1) * PERIOD_S
         for _ in range(kicks + 1):
             span = (0.0, times[-1])
             method = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
             y = solve_ivp(lambda _, x: self.rates(x), span, state, t_eval=times, **method).y
-            found.append(y[:, :-1].T)
+            phases.append(y[:, :-1].T)
             state = y[:, -1] + rng.uniform(-kick, kick, self.n)
-        return np.concatenate(found)
+        return np.concatenate(phases)
 
     def answer(self, phases, **more):
         return chain_coupling("horizontal", self.names, phases, PERIOD_S, **more)
@@ -60,15 +60,15 @@ class Planted:
 def walk(chains, rng, duration_s, noise, kick, *, every_s=5.0, steps=5):
     """Phases of chains by Euler and Maruyama, every phase kicked by up to `kick` every so often."""
     K, psi, omega = (np.stack([getattr(chain, name) for chain in chains]) for name in PARTS)
-    h, state, found = PERIOD_S / steps, np.zeros(omega.shape), []
+    h, state, states = PERIOD_S / steps, np.zeros(omega.shape), []
     for k in range(round(duration_s / h)):
         if kick and k and k % round(every_s / h) == 0:
             state = state + rng.uniform(-kick, kick, state.shape)
         if k % steps == 0:
-            found.append(state)
+            states.append(state)
         rates = omega + np.sum(K * np.sin(state[:, None, :] - state[:, :, None] - psi), axis=2)
         state = state + h * rates + noise * math.sqrt(h) * rng.standard_normal(state.shape)
-    return np.stack(found, axis=1)
+    return np.stack(states, axis=1)
 
 
 @pytest.mark.slow

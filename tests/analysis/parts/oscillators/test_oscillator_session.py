@@ -27,7 +27,7 @@ def write(path, seconds, **fields):
     gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: chain}), ROBOT)
     readings = Readings.nothing(ROBOT)
     with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        found = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
+        channel = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
         commands = writer.joint_state("/joint_commands", ROBOT.joint_names, unit="rad")
         states = writer.joint_state("/joint_states", ROBOT.joint_names, unit="rad")
         before = np.zeros(len(ROBOT.joints))
@@ -35,7 +35,7 @@ def write(path, seconds, **fields):
             t_ns = EPOCH_NS + k * 10_000_000
             tick = gait.step(k / 100, readings)
             angle = before + 0.2 * (tick.command - before)
-            found.write(t_ns, tick.values)
+            channel.write(t_ns, tick.values)
             commands.write(t_ns, tick.command)
             states.write(t_ns, before)
             # What a sample tells is known a period later.
@@ -62,8 +62,8 @@ def test_a_kicked_session_gives_its_couplings(tmp_path, feedback, command, repor
         ahead = NAMES.index(link["source"]) - NAMES.index(link["target"])
         # A wave from head to tail: the phase falls by the lag from joint to joint.
         assert link["lag_rad"]["value"] == pytest.approx(-ahead * LAG, abs=0.1)
-    for one in chain["oscillators"]:
-        assert one["feedback"]["value"] == pytest.approx(feedback, abs=0.06)
+    for oscillator in chain["oscillators"]:
+        assert oscillator["feedback"]["value"] == pytest.approx(feedback, abs=0.06)
     out = command("analyse", path).out
     assert "Oscillators, horizontal: 10 couplings identified (condition number" in out
 

@@ -35,21 +35,21 @@ def maps(tmp_path_factory):
 def test_each_cycle_has_its_own_gain_and_lag(maps):
     assert (maps.driven, maps.start_s.size) == (NAMES, CYCLES)
     assert maps.period_s == pytest.approx(1.0, abs=1e-5)
-    known = np.arange(CYCLES) != 5
+    sampled = np.arange(CYCLES) != 5
     # The period comes from the responses, too, whose steps move it by 1e-6; the limits of the
     # cycles move with it.
-    np.testing.assert_allclose(maps.gain[:, known], GAINS[:, known], atol=1e-4)
-    expected = np.tile(LAG[:, None], CYCLES)[:, known]
-    np.testing.assert_allclose(maps.lag_rad[:, known], expected, atol=1e-3)
+    np.testing.assert_allclose(maps.gain[:, sampled], GAINS[:, sampled], atol=1e-4)
+    expected = np.tile(LAG[:, None], CYCLES)[:, sampled]
+    np.testing.assert_allclose(maps.lag_rad[:, sampled], expected, atol=1e-3)
 
 
 def test_power_is_torque_times_velocity_with_its_sign(maps):
     # Mean of drag v^2 is drag (2 pi f A)^2 / 2.
     peak = 2 * np.pi * AMPLITUDE * GAINS
     truth = np.array([[0.5], [-0.2], [0.1]]) * peak**2 / 2
-    known = np.arange(CYCLES) != 5
+    sampled = np.arange(CYCLES) != 5
     assert maps.powered == NAMES
-    np.testing.assert_allclose(maps.power_w[:, known], truth[:, known], rtol=0.02)
+    np.testing.assert_allclose(maps.power_w[:, sampled], truth[:, sampled], rtol=0.02)
 
 
 def test_a_cycle_without_samples_is_missing_not_zero(maps):
@@ -61,12 +61,12 @@ def test_a_cycle_without_samples_is_missing_not_zero(maps):
 def test_amplitudes_are_exact_on_uneven_times():
     t_s = np.sort(np.random.default_rng(2).uniform(0.0, 3.0, 240))
     values = 0.3 + np.real(0.7 * np.exp(0.4j) * np.exp(2j * np.pi * t_s))
-    found = amplitudes(t_s, values, starts_of(t_s, np.arange(4.0)), 2 * np.pi)
-    np.testing.assert_allclose(found, 0.7 * np.exp(0.4j), atol=1e-12)
+    measured = amplitudes(t_s, values, starts_of(t_s, np.arange(4.0)), 2 * np.pi)
+    np.testing.assert_allclose(measured, 0.7 * np.exp(0.4j), atol=1e-12)
 
 
 def test_too_few_samples_tell_nothing():
     t_s = np.array([0.1, 0.2, 0.3, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])
-    found = amplitudes(t_s, np.cos(2 * np.pi * t_s), starts_of(t_s, np.arange(3.0)), 2 * np.pi)
-    assert np.isnan(found[0])
-    assert found[1] == pytest.approx(1.0)
+    measured = amplitudes(t_s, np.cos(2 * np.pi * t_s), starts_of(t_s, np.arange(3.0)), 2 * np.pi)
+    assert np.isnan(measured[0])
+    assert measured[1] == pytest.approx(1.0)

@@ -56,16 +56,19 @@ def test_of_joints_of_one_kind_one_robot_in_twenty_is_named_at_most(count):
 )
 def test_one_that_differs_is_named_with_its_size(change, quantity, size):
     joints = robot(np.random.default_rng(7), 8) | {"odd": joint(**change)}
-    (found,) = unlike(joints, [list(joints)])
-    assert (found.joint, found.quantity, found.rank) == ("odd", quantity, 1)
-    assert found.deviation == pytest.approx(size, rel=0.1)
-    assert found.ci95[0] < size < found.ci95[1]
+    (difference,) = unlike(joints, [list(joints)])
+    assert (difference.joint, difference.quantity, difference.rank) == ("odd", quantity, 1)
+    assert difference.deviation == pytest.approx(size, rel=0.1)
+    assert difference.ci95[0] < size < difference.ci95[1]
 
 
 def test_two_that_differ_do_not_hide_each_other():
     joints = robot(np.random.default_rng(3), 10)
     joints |= {"first": joint(gain=0.6), "second": joint(gain=0.62)}
-    assert [found.joint for found in unlike(joints, [list(joints)])] == ["first", "second"]
+    assert [difference.joint for difference in unlike(joints, [list(joints)])] == [
+        "first",
+        "second",
+    ]
 
 
 def test_joints_of_two_groups_are_compared_within_each():

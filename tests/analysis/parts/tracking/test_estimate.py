@@ -41,26 +41,26 @@ def late(delay_s, *, held=False, rate_hz=50.0, position_hz=73.0, noise=0.0, seed
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.0713, 0.2])
 def test_a_pure_delay_without_noise_is_exact(delay_s):
-    found = track(*late(delay_s))
-    assert found.order == 0
-    assert not found.held
-    assert found.lag_s.value == pytest.approx(delay_s, abs=1e-6)
-    assert found.gain.value == pytest.approx(GAIN, abs=1e-6)
-    assert found.explained == pytest.approx(1.0)
+    tracked = track(*late(delay_s))
+    assert tracked.order == 0
+    assert not tracked.held
+    assert tracked.lag_s.value == pytest.approx(delay_s, abs=1e-6)
+    assert tracked.gain.value == pytest.approx(GAIN, abs=1e-6)
+    assert tracked.explained == pytest.approx(1.0)
 
 
 def test_offset_is_that_of_the_position_from_the_delayed_command():
     command, position = late(0.1)
-    found = track(command, position)
+    tracked = track(command, position)
     answer = (position.values - OFFSET) / GAIN
-    assert found.offset_rad.value == pytest.approx(np.mean(position.values - answer), abs=1e-6)
+    assert tracked.offset_rad.value == pytest.approx(np.mean(position.values - answer), abs=1e-6)
 
 
 @pytest.mark.parametrize("delay_s", [0.033, 0.12])
 def test_a_command_that_is_held_is_told_from_lines(delay_s):
-    found = track(*late(delay_s, held=True, noise=1e-4))
-    assert found.held
-    low, high = found.lag_s.ci95
+    tracked = track(*late(delay_s, held=True, noise=1e-4))
+    assert tracked.held
+    low, high = tracked.lag_s.ci95
     assert low <= delay_s <= high
     assert high - low < 0.02 / 4  # a quarter of the command's interval
 
@@ -69,8 +69,8 @@ def test_where_samples_coincide_the_interval_holds_lines_and_steps():
     """Positions at the commands' own times: k steps late, or any time up to one step less."""
     command, _ = late(0.0)
     shifted = np.concatenate([np.full(5, command.values[0]), command.values[:-5]])
-    found = track(command, Series("j", command.t_s, GAIN * shifted))
-    low, high = found.lag_s.ci95
+    tracked = track(command, Series("j", command.t_s, GAIN * shifted))
+    low, high = tracked.lag_s.ci95
     assert low == pytest.approx(0.08, abs=1e-3)
     assert high == pytest.approx(0.10, abs=1e-3)
 
@@ -89,11 +89,11 @@ def test_the_lag_of_servos_is_that_of_slow_motion(a, q, order):
     for seed in range(8):
         noise = 1e-3 * np.random.default_rng(seed).standard_normal(t_s.size)
         position = GAIN * np.interp(t_s - delay_s, fine_s, output) + noise
-        found = track(Series("j", asked_s, command), Series("j", t_s, position))
-        assert found.order == order
-        assert found.lag_s.value == pytest.approx(delay_s + a, abs=1e-4)
-        held.append(found.lag_s.ci95[0] <= delay_s + a <= found.lag_s.ci95[1])
-        held.append(found.gain.ci95[0] <= GAIN <= found.gain.ci95[1])
+        tracked = track(Series("j", asked_s, command), Series("j", t_s, position))
+        assert tracked.order == order
+        assert tracked.lag_s.value == pytest.approx(delay_s + a, abs=1e-4)
+        held.append(tracked.lag_s.ci95[0] <= delay_s + a <= tracked.lag_s.ci95[1])
+        held.append(tracked.gain.ci95[0] <= GAIN <= tracked.gain.ci95[1])
     assert sum(held) >= 13  # of sixteen at 95 %, with a probability of 99 %
 
 
@@ -116,11 +116,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     held, squares = 0, []
     for seed in range(60):
         command, position = late(0.09, noise=5e-3, seed=seed)
-        found = track(command, position)
-        held += found.lag_s.ci95[0] <= 0.09 <= found.lag_s.ci95[1]
+        tracked = track(command, position)
+        held += tracked.lag_s.ci95[0] <= 0.09 <= tracked.lag_s.ci95[1]
         rate = np.gradient(command.values, command.t_s)
         power = np.sum(np.interp(position.t_s - 0.09, command.t_s, rate) ** 2)
-        squares.append((found.lag_s.value - 0.09) ** 2 * power * (GAIN / 5e-3) ** 2)
+        squares.append((tracked.lag_s.value - 0.09) ** 2 * power * (GAIN / 5e-3) ** 2)
     assert held >= 52
     assert np.mean(squares) < 1.6  # of the bound without a gain and an offset to be fitted, 1
 
@@ -128,10 +128,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 def test_an_effect_before_its_cause_is_no_lag():
     command, _ = late(0.0)
     early = Series("j", command.t_s, np.interp(command.t_s + 0.03, command.t_s, command.values))
-    found = track(command, early)
-    assert found.lag_s.value == 0.0
-    assert found.lag_s.ci95 == (0.0, 0.0)
-    assert found.gain.value == pytest.approx(1.0, abs=1e-3)
+    tracked = track(command, early)
+    assert tracked.lag_s.value == 0.0
+    assert tracked.lag_s.ci95 == (0.0, 0.0)
+    assert tracked.gain.value == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_joint_that_stands_and_one_that_is_not_asked_have_none():
@@ -143,10 +143,10 @@ def test_a_joint_that_stands_and_one_that_is_not_asked_have_none():
 
 def test_a_long_record_is_thinned_out():
     """Half an hour at 200 Hz: every sixth sample, and the answer of a shorter one."""
-    found = track(*late(0.09, position_hz=200.0, noise=5e-3, length_s=1800.0))
+    tracked = track(*late(0.09, position_hz=200.0, noise=5e-3, length_s=1800.0))
     short = track(*late(0.09, position_hz=200.0, noise=5e-3, length_s=60.0))
-    assert found.lag_s.ci95[0] <= 0.09 <= found.lag_s.ci95[1]
-    width, shorter = (x.lag_s.ci95[1] - x.lag_s.ci95[0] for x in (found, short))
+    assert tracked.lag_s.ci95[0] <= 0.09 <= tracked.lag_s.ci95[1]
+    width, shorter = (x.lag_s.ci95[1] - x.lag_s.ci95[0] for x in (tracked, short))
     assert width < shorter / 1.5
 
 

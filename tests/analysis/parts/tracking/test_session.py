@@ -50,7 +50,7 @@ def test_the_joint_that_differs_is_named(tmp_path, change, words):
     answer = analysed(write(tmp_path / "a.mcap", **change)).answer
     assert answer.sentence.startswith("j2 "), answer.sentence
     assert words in answer.sentence
-    assert {found.joint for found in (*answer.stand_out, *answer.apart)} == {"j2"}
+    assert {difference.joint for difference in (*answer.stand_out, *answer.apart)} == {"j2"}
     assert not answer.not_following
 
 
@@ -70,7 +70,7 @@ def test_every_output_has_gain_lag_and_offset(tmp_path, command):
     assert weak.lag_s.value == pytest.approx(0.08, abs=2e-3)
     assert weak.explained > 0.99
     assert load(result.save(tmp_path / "a.json")) == result
-    record = next(one for one in result.to_dict()["tracking"] if one["joint"] == "j2")
+    record = next(row for row in result.to_dict()["tracking"] if row["joint"] == "j2")
     assert record["gain"] == weak.gain.value
     assert tuple(record["gain_ci95"]) == weak.gain.ci95
     frame = result.frames()["tracking"].set_index("joint")
