@@ -33,17 +33,17 @@ def test_every_sample_keeps_its_value_and_its_time(samples, data):
     stamp_ns, last_ns, offset_s, gathered = joined(gather(joint, t_ns, values, [cut]))
     rows, joints = np.nonzero(~np.isnan(offset_s))
     np.testing.assert_array_equal(np.isnan(offset_s), np.isnan(gathered[..., 0]))
-    found = {
+    times = {
         (int(j), int(gathered[r, j, 0])): int(stamp_ns[r] + round(offset_s[r, j] * 1e9))
         for r, j in zip(rows, joints, strict=True)
     }
-    assert found == {(int(j), i): int(t) for i, (j, t) in enumerate(zip(joint, t_ns, strict=True))}
+    assert times == {(int(j), i): int(t) for i, (j, t) in enumerate(zip(joint, t_ns, strict=True))}
     assert (np.nanmax(np.abs(offset_s)) * 1e9).round() <= LONGEST_ROUND_NS
     for r, latest in enumerate(last_ns):
         assert latest == stamp_ns[r] + round(np.nanmax(offset_s[r]) * 1e9)
     whole = joined(gather(joint, t_ns, values))
-    for one, other in zip((stamp_ns, last_ns, offset_s, gathered), whole, strict=True):
-        np.testing.assert_array_equal(one, other)
+    for part, other in zip((stamp_ns, last_ns, offset_s, gathered), whole, strict=True):
+        np.testing.assert_array_equal(part, other)
 
 
 def test_a_missing_servo_leaves_a_gap_and_not_a_shift():

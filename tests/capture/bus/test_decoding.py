@@ -72,8 +72,8 @@ def test_every_layout_in_the_64_bytes_of_can_fd(position, length, byte_order, ki
     signal = Signal("s", start, length, byte_order, kind != "unsigned", conversion=conversion)
     data = np.random.default_rng(seed).integers(0, 256, (5, 64), dtype=np.uint8)
     data[0] = 255
-    found, expected = BitField.of(signal).values(data), reference(signal, data)
-    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=0)
+    values, expected = BitField.of(signal).values(data), reference(signal, data)
+    np.testing.assert_allclose(values, expected, rtol=1e-15, atol=0)
 
 
 @pytest.mark.parametrize("length", [16, 32, 64])
@@ -84,8 +84,8 @@ def test_floats_of_every_layout(byte_order, length, rng):
     for order, start, size in layouts():
         if (order, size) == (byte_order, length):
             signal = Signal("s", start, length, byte_order, True, conversion=conversion)
-            found, expected = BitField.of(signal).values(data), reference(signal, data)
-            np.testing.assert_array_equal(found, expected)
+            values, expected = BitField.of(signal).values(data), reference(signal, data)
+            np.testing.assert_array_equal(values, expected)
 
 
 @given(
@@ -168,9 +168,9 @@ def test_nested_multiplexing(muxed, seed):
             decoded = {"always": frame["data"][7] * 0.5}
         for name, value in decoded.items():
             expected.setdefault(name, {})[row] = value
-    found = {sample.signals[0].signal: sample for sample in samples}
-    assert set(found) == set(expected) - {"outer", "inner"}
-    for name, sample in found.items():
+    by_name = {sample.signals[0].signal: sample for sample in samples}
+    assert set(by_name) == set(expected) - {"outer", "inner"}
+    for name, sample in by_name.items():
         values = sample.values if name != "two" else (sample.values - 1) / 2
         assert dict(zip(sample.rows.tolist(), values.tolist(), strict=True)) == expected[name]
         assert sample.t_ns.tolist() == [row * 1000 + 7 for row in expected[name]]
@@ -201,14 +201,14 @@ def test_frames_of_many_joints_and_sensors_at_once(seed):
                 codes = {entry.unknown: math.nan, entry.out_of_range: math.inf}
                 expected[row, entry] = codes.get(raw, value * UNITS[entry.unit].factor)
     samples, tally = BusDecoder(robot).decode(frames)
-    found = {
+    signals = {
         (row, decoded.signals[k]): value
         for decoded in samples
         for row, k, value in zip(
             decoded.rows.tolist(), decoded.member.tolist(), decoded.values.tolist(), strict=True
         )
     }
-    assert found == pytest.approx(expected, rel=1e-12, abs=1e-12, nan_ok=True)
+    assert signals == pytest.approx(expected, rel=1e-12, abs=1e-12, nan_ok=True)
     assert (tally.decoded, tally.problems(), tally.notes()) == (300, [], [])
 
 
@@ -265,8 +265,8 @@ def test_the_direction_tells_a_request_from_its_reply():
     frames["data"] = [list(bytes.fromhex(text)) for text in texts]
     frames["dir"] = [fr.DIR_TX, fr.DIR_RX, fr.DIR_TX, fr.DIR_RX, fr.DIR_RX]
     samples, tally = decoder.decode(frames)
-    found = {s.signals[0].quantity: (s.rows.tolist(), s.values.tolist()) for s in samples}
-    assert found == {
+    by_quantity = {s.signals[0].quantity: (s.rows.tolist(), s.values.tolist()) for s in samples}
+    assert by_quantity == {
         "command": ([0], pytest.approx([math.radians(-132.49)], rel=1e-15)),
         "position": ([3], pytest.approx([math.radians(-132.50)], rel=1e-15)),
         "velocity": ([1, 4], pytest.approx([0, math.radians(126)], rel=1e-15)),

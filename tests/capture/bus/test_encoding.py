@@ -54,8 +54,8 @@ def test_every_layout_as_cantools_packs_it(position, length, size, layout, share
 
 def test_values_beyond_the_field_become_its_ends():
     field = BitField(0, 8, signed=True, scale=0.5, offset=1.0)
-    found = [field.raw_bits(value) for value in (-1e9, 1e9, math.inf, -math.inf, 1.26, 1.24)]
-    assert found == [0x80, 0x7F, 0x7F, 0x80, 1, 0]
+    raw = [field.raw_bits(value) for value in (-1e9, 1e9, math.inf, -math.inf, 1.26, 1.24)]
+    assert raw == [0x80, 0x7F, 0x7F, 0x80, 1, 0]
     assert field.raw_bits(50.0, field.raw_range(upper=11.0)) == 20
     assert field.raw_bits(-50.0, field.raw_range(lower=-9.0)) == (-20) & 0xFF
     assert BitField(0, 8, scale=-1.0).raw_bits(-1e9) == 0xFF  # a falling scale turns the ends round
@@ -91,10 +91,10 @@ def test_a_robots_values_come_back_within_half_a_step(direction):
     frames = encoder.encode(values, 7)
     assert set(frames["dir"]) == {DIR_TX if direction is Direction.TX else DIR_RX}
     assert set(frames["t_host_ns"]) == {7}
-    found = decoded(robot, frames)
-    assert {key for key in found if key[1] in step} == set(values)
+    readings = decoded(robot, frames)
+    assert {key for key in readings if key[1] in step} == set(values)
     for key, value in values.items():
-        assert found[key] == pytest.approx(value, abs=1.0001 * step[key[1]]), key
+        assert readings[key] == pytest.approx(value, abs=1.0001 * step[key[1]]), key
 
 
 def test_frames_are_those_that_cantools_packs():
@@ -123,9 +123,9 @@ def test_a_value_that_is_not_given_stays_as_it_was_sent():
     encoder = BusEncoder(robot, Direction.RX)
     position, velocity = (("joint01", q, "") for q in (Quantity.POSITION, Quantity.VELOCITY))
     encoder.encode({position: 0.1, velocity: 1.0})
-    found = decoded(robot, encoder.encode({velocity: 2.0}))
-    assert found[position] == pytest.approx(0.1, abs=1e-4)
-    assert found[velocity] == pytest.approx(2.0, abs=1e-3)
+    readings = decoded(robot, encoder.encode({velocity: 2.0}))
+    assert readings[position] == pytest.approx(0.1, abs=1e-4)
+    assert readings[velocity] == pytest.approx(2.0, abs=1e-3)
     for nothing in ({}, {("joint01", Quantity.COMMAND, ""): 1}):
         assert len(encoder.encode(nothing)) == 0
 
@@ -137,9 +137,9 @@ def test_what_is_out_of_range_or_unknown_has_numbers_of_its_own():
     codes = database.decode_message("ranges_1", frame["data"].tobytes())
     unknown = dict.fromkeys(("ir02", "ir03", "ir04"), "unknown")
     assert codes == {"ir01": "nothing in range", **unknown}
-    found = decoded(robot, np.array([frame]))
-    assert found.pop(("ir01", Quantity.RANGE, "")) == math.inf
-    assert all(map(math.isnan, found.values()))
+    readings = decoded(robot, np.array([frame]))
+    assert readings.pop(("ir01", Quantity.RANGE, "")) == math.inf
+    assert all(map(math.isnan, readings.values()))
 
 
 def test_without_such_a_number_nothing_in_range_is_the_greatest_distance():

@@ -38,18 +38,18 @@ def decoded(robot, protocol, packets, pieces=1):
     records = np.concatenate(
         [clock.feed(packet, 10**9 + k * 10**6, tally) for k, packet in enumerate(packets)]
     )
-    decoder, found, counts = open_decoder(robot), [], []
+    decoder, rows, counts = open_decoder(robot), [], []
     for part in np.array_split(records, pieces):
         samples, count = decoder.decode(part)
         counts.append(count)
         for sample in samples:
             for m, t, value in zip(sample.member, sample.t_ns, sample.values, strict=True):
                 key = (sample.signals[m].target, sample.signals[m].quantity.value)
-                found.append((*key, (int(t) - 10**9) // 10**6, value))
+                rows.append((*key, (int(t) - 10**9) // 10**6, value))
     total = counts[0]
     for count in counts[1:]:
         total.add(count)
-    return sorted(found), total
+    return sorted(rows), total
 
 
 def le(value, size):
@@ -87,7 +87,7 @@ def test_dynamixel_commands_and_replies(pieces):
     packets.append(port.take())
     packets.append(dynamixel_packet(11, 0x55, bytes((0, 9))))  # a reply to nothing
     packets.append(dynamixel_packet(77, 3, bytes((116, 0, *le(1, 4)))))
-    found, tally = decoded(robot, "dynamixel2", packets, pieces)
+    records, tally = decoded(robot, "dynamixel2", packets, pieces)
     rpm = 0.229 * math.tau / 60
     expected = sorted(
         [
@@ -104,8 +104,10 @@ def test_dynamixel_commands_and_replies(pieces):
             ("joint01", "command", 7, 0.0),
         ]
     )
-    assert [each[:3] for each in found] == [each[:3] for each in expected]
-    assert [each[3] for each in found] == pytest.approx([each[3] for each in expected], abs=1e-12)
+    assert [record[:3] for record in records] == [record[:3] for record in expected]
+    assert [record[3] for record in records] == pytest.approx(
+        [record[3] for record in expected], abs=1e-12
+    )
     assert tally.unknown == {"servo 77 register 116": 1}
     assert tally.silent["servo 12 register 104"] == 1
     assert tally.silent["servo 11"] == 1
@@ -124,13 +126,13 @@ def test_feetech_staged_writes_repeated_requests_and_error_bits():
     packets += [request, feetech_packet(2, 0, bytes(3))]  # of another length
     sdk.writeTxOnly(port, 1, 41, 8, [0, 0xFF, 7, 0, 0, 0, 0, 0])  # acceleration, goal, time, speed
     packets.append(port.take())
-    found, tally = decoded(robot, "feetech", packets)
-    assert [each[:3] for each in found] == [
+    records, tally = decoded(robot, "feetech", packets)
+    assert [record[:3] for record in records] == [
         ("shoulder_lift", "position", 4),
         ("shoulder_pan", "command", 1),
         ("shoulder_pan", "command", 9),
     ]
-    values = [each[3] for each in found]
+    values = [record[3] for record in records]
     assert values == pytest.approx([-1024 * STEP, 1024 * STEP, -STEP], abs=1e-12)
     assert tally.decoded == 3
 
@@ -146,8 +148,8 @@ def test_signs_and_the_big_endian_scs_series():
         feetech_packet(12, 2, bytes((56, 2))),
         feetech_packet(12, 0, struct.pack(">H", 512 + 100)),
     ]
-    found, _ = decoded(robot, "feetech", packets)
-    values = {each[:2]: each[3] for each in found}
+    records, _ = decoded(robot, "feetech", packets)
+    values = {record[:2]: record[3] for record in records}
     assert values == pytest.approx(
         {
             ("joint01", "position"): STEP,

@@ -105,8 +105,8 @@ def test_files_of_other_makes(options, tmp_path, described):
     # A channel without messages stands in no chunk's index; only a summary or a look inside has it.
     assert topics.keys() == CHANNELS.keys()
     for topic, (encoding, schema, message) in CHANNELS.items():
-        found = topics[topic]
-        assert found == found | {
+        described_topic = topics[topic]
+        assert described_topic == described_topic | {
             "messages": 20 if message is not None else 0,
             "type": schema[0] if schema else "",
             "encoding": encoding or None,

@@ -21,7 +21,7 @@ def write(path, names=("hip", "knee"), **options):
 
 
 def test_list_and_show_name_the_shipped_robots(report_of, command):
-    assert [one["name"] for one in report_of("robot", "list")] == list(robot_names())
+    assert [robot["name"] for robot in report_of("robot", "list")] == list(robot_names())
     facts = report_of("robot", "show", "snake25")
     assert [fact["name"] for fact in facts["joints"]] == list(load_robot("snake25").joint_names)
     text = command("robot", "show", "snake25").out
@@ -73,10 +73,10 @@ def test_a_robot_given_for_a_foreign_log_orders_and_limits_it(tmp_path, command,
         assert session.robot == load_robot(path)
         assert session.joints("/joint_states").names == ("knee", "hip")
     assert opened(log).robot is None
-    found = report_of("analyse", log, "--robot", path)
-    assert found["session"]["robot"] == "mine"
-    assert [joint["plane"] for joint in found["joints"]] == ["horizontal"] * 2
-    assert f"--robot {path}" in found["provenance"]["command"]
+    report = report_of("analyse", log, "--robot", path)
+    assert report["session"]["robot"] == "mine"
+    assert [joint["plane"] for joint in report["joints"]] == ["horizontal"] * 2
+    assert f"--robot {path}" in report["provenance"]["command"]
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_a_rosbag2_folder_is_one_session(folder):
 
 def joints(first=0.0, last=3.0):
     """A fill with a controller's joints from one time to another [s]."""
-    return filling(lambda own, *tick: tick[1] >= first and own.controller(*tick), last)
+    return filling(lambda log, *tick: tick[1] >= first and log.controller(*tick), last)
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_commands_read_the_bags_of_a_folder(line, bags, report_of, command):
 @pytest.mark.nightly
 def test_a_report_has_the_bags_of_a_folder(bags, tmp_path, report_of):
     report = report_of("report", bags / "day", "-o", tmp_path / "page.html")
-    assert [len(one["sentence"]) > 0 for one in report["answers"]] == [True] * 5
+    assert [len(answer["sentence"]) > 0 for answer in report["answers"]] == [True] * 5
 
 
 @pytest.mark.parametrize("verb", ["info", "check"])

@@ -74,5 +74,5 @@ def test_what_is_written_reads_the_same():
     ],
 )
 def test_each_fault_is_noted(change, fault):
-    (found,) = given({**WHOLE, **change})[1]
-    assert found.startswith(fault)
+    (text,) = given({**WHOLE, **change})[1]
+    assert text.startswith(fault)

@@ -21,5 +21,5 @@ def test_colours_read_on_black_and_on_white():
 @pytest.mark.parametrize("count", [1, 12, 25, 60])
 def test_hex_and_bytes_agree_and_each_joint_has_a_colour(count):
     bytes_of = joint_colors(count)[:, :3]
-    assert joint_hex(count) == tuple("#{:02x}{:02x}{:02x}".format(*one) for one in bytes_of)
+    assert joint_hex(count) == tuple("#{:02x}{:02x}{:02x}".format(*colour) for colour in bytes_of)
     assert len(set(joint_hex(count))) == count

@@ -28,9 +28,9 @@ def test_what_was_published_is_there_under_its_name_and_whole(disk, replace):
         disk.settle()
     disk.run(PUBLISHED, disk.root / "run.mcap", replace)
     for loss in Loss:
-        found = disk.after(loss)
-        assert [path.name for path in found.iterdir()] == ["run.mcap"]
-        assert (found / "run.mcap").read_bytes() == NEW
+        left = disk.after(loss)
+        assert [path.name for path in left.iterdir()] == ["run.mcap"]
+        assert (left / "run.mcap").read_bytes() == NEW
 
 
 REPLACED = """

@@ -69,14 +69,14 @@ def test_all_that_has_a_place_is_kept_and_the_rest_is_named(kind, tmp_path, repo
     with Session.open(bag) as before, Session.open(output) as after:
         old, new = before.with_joints(response=dynamic), after
         for topic, field in (
-            *(("/joint_states", each) for each in ("position", "velocity", "effort")),
+            *(("/joint_states", part) for part in ("position", "velocity", "effort")),
             *(("/joint_commands", "position"), ("/joint_current", "position")),
             ("/second/encoders", "position"),
         ):
-            one, other = old.joints(topic, field), new.joints(topic, field)
-            assert (one.names, one.unit) == (other.names, other.unit)
-            np.testing.assert_array_equal(one.t_ns, other.t_ns)
-            np.testing.assert_array_equal(one.values, other.values)
+            original, other = old.joints(topic, field), new.joints(topic, field)
+            assert (original.names, original.unit) == (other.names, other.unit)
+            np.testing.assert_array_equal(original.t_ns, other.t_ns)
+            np.testing.assert_array_equal(original.values, other.values)
         np.testing.assert_array_equal(
             np.transpose(new.joints("/joint_commands").values),
             [commanded(t_s) for _, t_s in ticks(4.0)],
@@ -101,7 +101,7 @@ def test_the_response_of_an_import_is_that_of_the_bag(kind, tmp_path, report_of)
     report_of("import", bag, "-o", output)
     first, second = report_of("analyse", bag), report_of("analyse", output)
     for key in ("gain", "lag_rad"):
-        values = [[joint[key] for joint in one["joints"]] for one in (first, second)]
+        values = [[joint[key] for joint in report["joints"]] for report in (first, second)]
         np.testing.assert_array_equal(*values)
 
 
@@ -110,9 +110,9 @@ def test_a_db3_without_definitions_finds_the_release(version, tmp_path):
     old = version in ("foxy", "galactic")
     parts = ("desired", "actual") if old else ("reference", "feedback")
 
-    def write(own, *tick):
-        own.controller(*tick, "/arm/state", parts)
-        own.dynamic(*tick)
+    def write(log, *tick):
+        log.controller(*tick, "/arm/state", parts)
+        log.dynamic(*tick)
 
     kind = {"storage": StoragePlugin.SQLITE3, "store": typestore(version)}
     folder = write_bag(tmp_path / "bag", filling(write, 0.5), **kind)
@@ -121,9 +121,9 @@ def test_a_db3_without_definitions_finds_the_release(version, tmp_path):
         base.execute("DELETE FROM message_definitions")
     base.close()
     with Session.open(path) as session:
-        found = session.joint_topics()
-        assert found.command == f"/arm/state.{parts[0]}"
-        values = np.transpose(session.joints(found.command).values)
+        topics = session.joint_topics()
+        assert topics.command == f"/arm/state.{parts[0]}"
+        values = np.transpose(session.joints(topics.command).values)
         np.testing.assert_array_equal(values, [commanded(t_s) for _, t_s in ticks(0.5)])
         assert session.joints("/dynamic_joint_states.current").names == NAMES
 
@@ -140,12 +140,14 @@ def test_a_set_of_joints_that_changes_has_gaps(tmp_path):
     bag = write_bag(tmp_path / "bag", fill)
     import_bag(bag, tmp_path / "x.mcap")
     with Session.open(bag) as before, Session.open(tmp_path / "x.mcap") as after:
-        one, other = before.joints("/joint_states"), after.joints("/joint_states")
-        assert one.names == other.names == NAMES
+        original, other = before.joints("/joint_states"), after.joints("/joint_states")
+        assert original.names == other.names == NAMES
         for name in NAMES:
             kept = np.isfinite(other.signal(name).values)
-            np.testing.assert_array_equal(other.signal(name).values[kept], one.signal(name).values)
-            np.testing.assert_array_equal(other.signal(name).t_ns[kept], one.signal(name).t_ns)
+            np.testing.assert_array_equal(
+                other.signal(name).values[kept], original.signal(name).values
+            )
+            np.testing.assert_array_equal(other.signal(name).t_ns[kept], original.signal(name).t_ns)
 
 
 def test_refusals_name_the_option(tmp_path, command, monkeypatch):
@@ -181,9 +183,9 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
     import_bag(bag, tmp_path / "x.mcap")
     monkeypatch.setattr(bag_import, "_WINDOW_NS", 170_000_000)
     import_bag(bag, tmp_path / "y.mcap")
-    with Session.open(tmp_path / "x.mcap") as one, Session.open(tmp_path / "y.mcap") as other:
+    with Session.open(tmp_path / "x.mcap") as session, Session.open(tmp_path / "y.mcap") as other:
         for topic in ("/joint_states", "/joint_commands"):
-            first, second = one.joints(topic), other.joints(topic)
+            first, second = session.joints(topic), other.joints(topic)
             np.testing.assert_array_equal(first.values, second.values)
             np.testing.assert_array_equal(first.t_ns, second.t_ns)
 
@@ -191,10 +193,10 @@ def test_windows_do_not_show(tmp_path, monkeypatch):
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["bag", "mcap", pytest.param("db3", marks=pytest.mark.nightly)])
 def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypatch):
-    def write(own, *tick):
-        own.controller(*tick)
-        own.dynamic(*tick)
-        own.trajectory(*tick, count=3)
+    def write(log, *tick):
+        log.controller(*tick)
+        log.dynamic(*tick)
+        log.trajectory(*tick, count=3)
 
     scratch = tmp_path / "scratch"
     scratch.mkdir()
@@ -211,17 +213,17 @@ def test_a_mutated_bag_is_imported_or_refused_in_words(kind, tmp_path, monkeypat
         for place in draw.integers(len(data), size=1 + case):
             data[place] = draw.integers(256)
         path.write_bytes(data[: len(data) // 2] if case % 12 == 11 else data)
-        said = str(bag)
+        text = str(bag)
         try:
             import_bag(bag, output, force=True)
             with Session.open(bag) as session:
                 session.with_joints().joints("/joint_states")
         except UndulogError as error:
-            said = str(error)
-        assert str(bag) in said
+            text = str(error)
+        assert str(bag) in text
         path.write_bytes(whole[path])
         assert not any(scratch.iterdir())
-        assert {each.name for each in tmp_path.iterdir()} <= {name, "x.mcap", "scratch"}
+        assert {path.name for path in tmp_path.iterdir()} <= {name, "x.mcap", "scratch"}
 
 
 @pytest.mark.parametrize("topic", ["/arm/joint_trajectory", "/arm/controller_state", "/states"])
@@ -262,16 +264,16 @@ def test_damaged_messages_are_read_or_counted(topic, tmp_path):
 
 def test_big_endian_and_other_types_are_counted(tmp_path):
     def fill(bag):
-        store, own = bag.store, Filler(bag)
+        store, filler = bag.store, Filler(bag)
         for k, tick in enumerate(ticks(1.0)):
-            own.controller(*tick)
+            filler.controller(*tick)
             if k % 10 == 0:
                 sample = message(store, CONTROLLER, joint_names=list(NAMES))
                 data = store.serialize_cdr(sample, CONTROLLER, little_endian=False)
                 bag.writer.write(bag.ways["/arm/controller_state"], tick[0], bytes(data))
 
     with Session.open(write_bag(tmp_path / "bag", fill)) as session:
-        found = session.joints("/arm/controller_state.feedback")
-        assert len(found.t_ns[0]) == 100
-        assert found.t_ns[0][0] == EPOCH_NS
+        series = session.joints("/arm/controller_state.feedback")
+        assert len(series.t_ns[0]) == 100
+        assert series.t_ns[0][0] == EPOCH_NS
         assert any("10 messages can't be read" in text for text in session.warnings)

@@ -39,9 +39,9 @@ def classic_frames(count, start_ns, step_ns):
     return frames
 
 
-def same(found, expected, fields=FIELDS):
+def same(frames, expected, fields=FIELDS):
     for name in fields:
-        np.testing.assert_array_equal(found[name], expected[name], name)
+        np.testing.assert_array_equal(frames[name], expected[name], name)
 
 
 # -- the log -------------------------------------------------------------------------------
@@ -112,9 +112,9 @@ def test_the_check_counts_them(tmp_path, command):
     fd = every_kind(fd=True, step_ns=10_000_000)
     path = write_frames(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
     health = check_session(path)
-    found = {bus.topic: (bus.frames, bus.rate_hz) for bus in health.buses}
-    assert found.keys() == {"/can/can0", FD}
-    assert (found["/can/can0"][0], found[FD]) == (200, (len(fd), pytest.approx(100)))
+    by_topic = {bus.topic: (bus.frames, bus.rate_hz) for bus in health.buses}
+    assert by_topic.keys() == {"/can/can0", FD}
+    assert (by_topic["/can/can0"][0], by_topic[FD]) == (200, (len(fd), pytest.approx(100)))
     text = " ".join(finding.sentence for finding in health.findings)
     assert "silent" not in text
     assert "can't be read" not in text
@@ -243,8 +243,8 @@ def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path):
         f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log does not mark them, "
         "and shorter ones count as classic"
     )
-    found = [bytes(frame["data"][: frame["len"]]) for frame in frames]
-    assert found == [bytes(message.data) for message in long]
+    payloads = [bytes(frame["data"][: frame["len"]]) for frame in frames]
+    assert payloads == [bytes(message.data) for message in long]
 
 
 def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path):

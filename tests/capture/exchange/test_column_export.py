@@ -52,9 +52,9 @@ def assert_same_samples(table, session, topic, field, column):
     assert len(rows) == sum(map(len, signals.t_ns))
     assert (np.diff(rows["t_ns"]) >= 0).all()
     for name, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True):
-        own = rows[rows["joint"] == name]
-        np.testing.assert_array_equal(own["t_ns"], t_ns)
-        np.testing.assert_array_equal(own[column], values)  # bit for bit, NaN where NaN
+        of_joint = rows[rows["joint"] == name]
+        np.testing.assert_array_equal(of_joint["t_ns"], t_ns)
+        np.testing.assert_array_equal(of_joint[column], values)  # bit for bit, NaN where NaN
     assert table[column][table["topic"] != topic].isna().all()
 
 
@@ -144,8 +144,8 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path, opened):
     export_columns(tmp_path / "run.mcap", tmp_path / "x.csv", topics=["/joint_states"])
     options = ["t_ns=time:ns", "joint_states.position [rad]=joint01.position:rad"]
     columns = column_map_from_options(options, robot)
-    found = open_mapped(tmp_path / "x.csv", columns)
-    import_tables(found, tmp_path / "back.mcap", robot=robot, column_map=columns)
+    tables = open_mapped(tmp_path / "x.csv", columns)
+    import_tables(tables, tmp_path / "back.mcap", robot=robot, column_map=columns)
     back = opened(tmp_path / "back.mcap").joints("/joint_states").signal("joint01")
     np.testing.assert_array_equal(back.t_ns, states.t_ns)
     np.testing.assert_array_equal(back.values, states.values)

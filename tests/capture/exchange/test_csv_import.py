@@ -41,8 +41,8 @@ def load(source, tmp_path):
     (tmp_path / "map.toml").write_text(JOINT7)
     robot = load_robot("arcsnake-joint")
     columns = column_map.read_column_map(tmp_path / "map.toml", robot)
-    found = open_mapped(source, columns)
-    return import_tables(found, tmp_path / "run.mcap", robot=robot, column_map=columns)
+    tables = open_mapped(source, columns)
+    return import_tables(tables, tmp_path / "run.mcap", robot=robot, column_map=columns)
 
 
 @pytest.mark.skipif(not ARCSNAKE.exists(), reason=f"the ArcSnake data are not at {ARCSNAKE}")
@@ -87,8 +87,8 @@ def csv_file(tmp_path, text):
 def run(tmp_path, text, *options, time="s", **more):
     robot = load_robot("snake13")
     columns = column_map.column_map_from_options((f"t=time:{time}", *options), robot)
-    found = open_mapped(csv_file(tmp_path, text), columns)
-    return import_tables(found, tmp_path / "run.mcap", robot=robot, column_map=columns, **more)
+    tables = open_mapped(csv_file(tmp_path, text), columns)
+    return import_tables(tables, tmp_path / "run.mcap", robot=robot, column_map=columns, **more)
 
 
 def test_columns_of_several_joints_and_quantities(tmp_path):

@@ -41,7 +41,7 @@ def exported(tmp_path_factory):
 def states_by_mcap(path):
     """Times and positions by mcap and mcap-ros2-support."""
     messages_of(path)  # checks each CRC
-    rows = [(t, each.position) for _, t, each in decoded_of(path, ["/joint_states"])]
+    rows = [(t, message.position) for _, t, message in decoded_of(path, ["/joint_states"])]
     return np.array([t for t, _ in rows]), np.array([values for _, values in rows])
 
 
@@ -117,17 +117,17 @@ def test_tables(read, suffix, exported):
     for k, name in enumerate(NAMES):
         np.testing.assert_array_equal(wide[f"{name}.position [rad]"], data[:, 0, k])
         np.testing.assert_array_equal(wide[f"{name}.velocity [rad/s]"], data[:, 1, k])
-        own = long[(long["topic"] == "/joint_states") & (long["joint"] == name)]
-        np.testing.assert_array_equal(own["t_ns"], T_NS)
-        np.testing.assert_array_equal(own["joint_states.effort [N m]"], data[:, 2, k])
+        of_joint = long[(long["topic"] == "/joint_states") & (long["joint"] == name)]
+        np.testing.assert_array_equal(of_joint["t_ns"], T_NS)
+        np.testing.assert_array_equal(of_joint["joint_states.effort [N m]"], data[:, 2, k])
     assert {str(long[name].dtype) for name in long.columns[3:]} == {"float64"}
 
 
 def test_a_dataset(exported):
     folder, data = exported
     table = ds.dataset(folder / "set/data", format="parquet").to_table()
-    found = np.array(table["observation.state"].to_pylist(), dtype=np.float32)
-    np.testing.assert_array_equal(found, data[:, 0].astype(np.float32))
+    states = np.array(table["observation.state"].to_pylist(), dtype=np.float32)
+    np.testing.assert_array_equal(states, data[:, 0].astype(np.float32))
     frames = duckdb.sql(f"select * from '{folder}/set/data/*/*.parquet' order by index").df()
     np.testing.assert_array_equal(np.stack(frames["action"]), data[:, 0].astype(np.float32))
     assert list(pd.read_parquet(folder / "set/meta/tasks.parquet").columns) == ["task_index"]

@@ -59,8 +59,8 @@ def frame(draw):
 
 def in_order(frames):
     """By time; those of one time keep the order of their buses, as a merge has it."""
-    ordered = sorted(frames, key=lambda each: (each.t_ns, each.bus))
-    return [replace(each, t_ns=T0 + each.t_ns) for each in ordered]
+    ordered = sorted(frames, key=lambda can_frame: (can_frame.t_ns, can_frame.bus))
+    return [replace(can_frame, t_ns=T0 + can_frame.t_ns) for can_frame in ordered]
 
 
 traces = st.lists(frame(), min_size=1, max_size=40).map(in_order)
@@ -82,12 +82,14 @@ def each_trace(check, count):
 
 def record_of(frames):
     array = fr.empty_frames(len(frames))
-    for row, each in zip(array, frames, strict=True):
-        flags = {"data": 0, "remote": fr.REMOTE_FLAG, "error": fr.ERROR_FLAG}[each.kind]
-        row["t_host_ns"] = each.t_ns
-        row["id_flags"] = each.identifier | flags | (fr.EXTENDED_FLAG if each.extended else 0)
-        row["dlc"], row["dir"] = each.dlc, fr.DIR_TX if each.sent else fr.DIR_RX
-        row["data"][: len(each.data)] = list(each.data)
+    for row, can_frame in zip(array, frames, strict=True):
+        flags = {"data": 0, "remote": fr.REMOTE_FLAG, "error": fr.ERROR_FLAG}[can_frame.kind]
+        row["t_host_ns"] = can_frame.t_ns
+        row["id_flags"] = (
+            can_frame.identifier | flags | (fr.EXTENDED_FLAG if can_frame.extended else 0)
+        )
+        row["dlc"], row["dir"] = can_frame.dlc, fr.DIR_TX if can_frame.sent else fr.DIR_RX
+        row["data"][: len(can_frame.data)] = list(can_frame.data)
     return array
 
 
@@ -104,9 +106,9 @@ def frame_of(row, bus):
 def session_of(path, frames):
     with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
         for bus in BUSES:
-            own = record_of([each for each in frames if each.bus == bus])
-            if len(own):
-                writer.frames(f"/can/{bus}").write(int(own["t_host_ns"].max()), own)
+            of_bus = record_of([can_frame for can_frame in frames if can_frame.bus == bus])
+            if len(of_bus):
+                writer.frames(f"/can/{bus}").write(int(of_bus["t_host_ns"].max()), of_bus)
     return path
 
 
@@ -124,76 +126,78 @@ def imported(trace, folder):
 
 def by_bus(frames):
     split = defaultdict(list)
-    for each in frames:
-        split[each.bus].append(each)
+    for can_frame in frames:
+        split[can_frame.bus].append(can_frame)
     return split
 
 
 def by_kind(frames_of_bus):
     split = defaultdict(list)
     for bus, frames in frames_of_bus.items():
-        for each in frames:
-            split[bus, each.kind].append(each)
+        for can_frame in frames:
+            split[bus, can_frame.kind].append(can_frame)
     return split
 
 
-def same_but_time(found, expected):
+def same_but_time(frames_by_bus, expected):
     timeless = (
-        {bus: [replace(each, t_ns=0) for each in frames] for bus, frames in buses.items()}
-        for buses in (found, expected)
+        {bus: [replace(can_frame, t_ns=0) for can_frame in frames] for bus, frames in buses.items()}
+        for buses in (frames_by_bus, expected)
     )
     assert next(timeless) == next(timeless)
 
 
-def time_errors(found, expected, shift_ns=0):
-    pairs = (zip(frames, expected[bus], strict=True) for bus, frames in found.items())
-    return np.array([one.t_ns + shift_ns - truth.t_ns for bus in pairs for one, truth in bus])
+def time_errors(frames_by_bus, expected, shift_ns=0):
+    pairs = (zip(frames, expected[bus], strict=True) for bus, frames in frames_by_bus.items())
+    return np.array(
+        [can_frame.t_ns + shift_ns - truth.t_ns for bus in pairs for can_frame, truth in bus]
+    )
 
 
 # -- session -> export -> import -----------------------------------------------------------
 
 
-def held_by_blf(each):
-    return replace(each, sent=False) if each.kind == "error" else each
+def held_by_blf(can_frame):
+    return replace(can_frame, sent=False) if can_frame.kind == "error" else can_frame
 
 
-def held_by_asc(each):
-    kept = held_by_python_cans_asc(each)
+def held_by_asc(can_frame):
+    kept = held_by_python_cans_asc(can_frame)
     return replace(kept, dlc=min(kept.dlc, 8))
 
 
-def held_by_python_cans_asc(each):
-    if each.kind == "error":
-        return replace(each, identifier=0, dlc=0, data=b"", sent=False)
-    return each
+def held_by_python_cans_asc(can_frame):
+    if can_frame.kind == "error":
+        return replace(can_frame, identifier=0, dlc=0, data=b"", sent=False)
+    return can_frame
 
 
 EXPORTED = {
     # suffix: what it holds of a frame, error of its time [ns]
-    ".log": (lambda each: each, 0),
+    ".log": (lambda can_frame: can_frame, 0),
     ".blf": (held_by_blf, 1000),  # of floating-point seconds in the reader, rounded to 1 us
     ".asc": (held_by_asc, 500),
 }
 FIELDS = {
-    "identifier": lambda each: each.identifier,
-    "length code": lambda each: each.dlc,
-    "data": lambda each: each.data,
-    "direction": lambda each: each.sent,
+    "identifier": lambda can_frame: can_frame.identifier,
+    "length code": lambda can_frame: can_frame.dlc,
+    "data": lambda can_frame: can_frame.data,
+    "direction": lambda can_frame: can_frame.sent,
 }
 
 
 def losses(frames, held, *, sub_us):
     """The sentences that must be reported, from the truth alone."""
     counts = Counter()
-    for each in frames:
-        kept = held(each)
-        lost = {name for name, of in FIELDS.items() if of(each) != of(kept)}
+    for can_frame in frames:
+        kept = held(can_frame)
+        lost = {name for name, of in FIELDS.items() if of(can_frame) != of(kept)}
         # Data is compared as eight bytes: a loss of zeros is none.
-        if "data" in lost and not any(each.data) and not any(kept.data):
+        if "data" in lost and not any(can_frame.data) and not any(kept.data):
             lost.discard("data")
-        if sub_us and each.t_ns % 1000:
+        if sub_us and can_frame.t_ns % 1000:
             lost.add("time below 1 us")
-        counts.update((each.kind, name) for name in lost)
+        counts.update((can_frame.kind, name) for name in lost)
     return sorted(
         f"1 {kind} frame loses its {name}" if n == 1 else f"{n} {kind} frames lose their {name}"
         for (kind, name), n in counts.items()
@@ -207,8 +211,8 @@ def exported_and_imported(suffix, frames):
         trace = folder / f"x{suffix}"
         report = export_log(session_of(folder / "run.mcap", frames), trace)
         back, _ = imported(trace, folder)
-    expected = by_bus([held(each) for each in frames])
-    assert report.facts["buses"] == {bus: len(own) for bus, own in by_bus(frames).items()}
+    expected = by_bus([held(can_frame) for can_frame in frames])
+    assert report.facts["buses"] == {bus: len(of_bus) for bus, of_bus in by_bus(frames).items()}
     assert sorted(report.warnings) == losses(frames, held, sub_us=suffix == ".asc")
     same_but_time(back, expected)
     # ASC has its date as local time, and an import leaves it alone: its times count from 2000.
@@ -225,36 +229,36 @@ def test_export_and_import(suffix, count):
 # -- python-can's writers -> import --------------------------------------------------------
 
 
-def message_of(each):
+def message_of(can_frame):
     return can.Message(
-        timestamp=each.t_ns / S,
-        arbitration_id=each.identifier,
-        is_extended_id=each.extended or each.kind == "error",
-        is_remote_frame=each.kind == "remote",
-        is_error_frame=each.kind == "error",
-        dlc=each.dlc,
-        data=each.data,
-        is_rx=not each.sent,
-        channel=int(each.bus.removeprefix("can")),
+        timestamp=can_frame.t_ns / S,
+        arbitration_id=can_frame.identifier,
+        is_extended_id=can_frame.extended or can_frame.kind == "error",
+        is_remote_frame=can_frame.kind == "remote",
+        is_error_frame=can_frame.kind == "error",
+        dlc=can_frame.dlc,
+        data=can_frame.data,
+        is_rx=not can_frame.sent,
+        channel=int(can_frame.bus.removeprefix("can")),
         check=False,
     )
 
 
-def held_by_python_cans_candump(each):
-    if each.kind == "error":  # its writer has one identifier for all of them, and no direction
-        return replace(each, identifier=0x80, dlc=len(each.data), sent=False)
-    if each.kind == "remote":
-        return replace(each, dlc=0)
-    return replace(each, dlc=len(each.data))
+def held_by_python_cans_candump(can_frame):
+    if can_frame.kind == "error":  # its writer has one identifier for all of them, and no direction
+        return replace(can_frame, identifier=0x80, dlc=len(can_frame.data), sent=False)
+    if can_frame.kind == "remote":
+        return replace(can_frame, dlc=0)
+    return replace(can_frame, dlc=len(can_frame.data))
 
 
-def held_by_csv(each):
-    return replace(each, sent=False, bus="can0")
+def held_by_csv(can_frame):
+    return replace(can_frame, sent=False, bus="can0")
 
 
-def held_by_trc(each):
+def held_by_trc(can_frame):
     """Channels are counted from 1, in the format and in python-can's reader of it."""
-    return replace(each, bus=f"can{int(each.bus.removeprefix('can')) + 1}")
+    return replace(can_frame, bus=f"can{int(can_frame.bus.removeprefix('can')) + 1}")
 
 
 WRITTEN = {
@@ -266,7 +270,7 @@ WRITTEN = {
     ".trc": (held_by_trc, 1500),  # its writer has data frames alone
     ".csv": (held_by_csv, 1000),
     ".db": (held_by_csv, 1000),
-    ".mf4": (lambda each: each, 400),
+    ".mf4": (lambda can_frame: can_frame, 400),
 }
 
 
@@ -274,7 +278,7 @@ def written_and_imported(suffix, frames):
     if suffix == ".mf4":
         pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     held, error_ns = WRITTEN[suffix]
-    frames = [each for each in frames if each.kind == "data" or suffix != ".trc"]
+    frames = [can_frame for can_frame in frames if can_frame.kind == "data" or suffix != ".trc"]
     if not frames:
         return
     with tempfile.TemporaryDirectory() as name:
@@ -286,7 +290,7 @@ def written_and_imported(suffix, frames):
     # Candump has no directions if its first frame has none, as python-can's error frames.
     without = suffix in {".csv", ".db"} or (suffix == ".log" and frames[0].kind == "error")
     assert directions == ("none" if without else "recorded")
-    kept = [held(each) for each in frames]
+    kept = [held(can_frame) for can_frame in frames]
     expected = by_bus(kept)
     if suffix == ".mf4":  # a group for each kind: the order of kinds at one time isn't in the file
         back, expected = by_kind(back), by_kind(expected)
@@ -295,7 +299,7 @@ def written_and_imported(suffix, frames):
     late = time_errors(back, expected)
     # Of the first frame's time, ASC has nothing, TRC 9 us.
     if suffix in {".asc", ".asc.gz", ".trc"}:
-        first = min(each.t_ns for own in back.values() for each in own)
+        first = min(can_frame.t_ns for of_bus in back.values() for can_frame in of_bus)
         assert suffix != ".trc" or abs(first - kept[0].t_ns) < 10_000
         assert suffix == ".trc" or first == RELATIVE_EPOCH_NS
         late -= first - kept[0].t_ns
@@ -322,7 +326,7 @@ def test_lines_that_a_reader_passes_over_are_counted(tmp_path):
     ]
     (tmp_path / "x.trc").write_text("\n".join(lines) + "\n")
     frames, report = imported(tmp_path / "x.trc", tmp_path)
-    found = [(each.identifier, each.data) for each in frames["can1"]]
-    assert found == [(0x123, b"\x11\x22"), (0x124, b"\x33")]
+    contents = [(can_frame.identifier, can_frame.data) for can_frame in frames["can1"]]
+    assert contents == [(0x123, b"\x11\x22"), (0x124, b"\x33")]
     unsupported = "TRCReader: Unsupported type"
     assert report.problems[:2] == [f"{unsupported} 'ER' (2 times)", f"{unsupported} 'ST'"]

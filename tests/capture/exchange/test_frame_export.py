@@ -138,7 +138,7 @@ def test_what_no_format_but_candump_has_is_counted(tmp_path):
 def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     assert export_log(source, tmp_path / "x.mcap").warnings == []
-    found = {}
+    by_sequence = {}
     with (tmp_path / "x.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
@@ -150,9 +150,9 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
             way = {"/can0/from_can_bus": fr.DIR_RX, "/can0/to_can_bus": fr.DIR_TX}[channel.topic]
             flags = decoded.is_extended * fr.EXTENDED_FLAG | decoded.is_rtr * fr.REMOTE_FLAG
             flags |= decoded.id | decoded.is_error * fr.ERROR_FLAG
-            found[message.sequence] = (stamp_ns, flags, decoded.dlc, way, bytes(decoded.data))
+            by_sequence[message.sequence] = (stamp_ns, flags, decoded.dlc, way, bytes(decoded.data))
     columns = [frames[name].tolist() for name in ("t_host_ns", "id_flags", "dlc", "dir")]
-    assert found == dict(enumerate(zip(*columns, map(bytes, frames["data"]), strict=True)))
+    assert by_sequence == dict(enumerate(zip(*columns, map(bytes, frames["data"]), strict=True)))
 
 
 def test_rosbags_reads_them(session_of_every_kind, tmp_path):
@@ -163,9 +163,9 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path):
     full.register(get_types_from_msg(CAN_MSGS_FRAME, "can_msgs/msg/Frame"))
     with AnyReader([tmp_path / "x.mcap"], default_typestore=store) as reader:
         read = [(t, full.deserialize_cdr(data, c.msgtype)) for c, t, data in reader.messages()]
-    found = [(t, message.id, bytes(message.data)) for t, message in read]
+    rows = [(t, message.id, bytes(message.data)) for t, message in read]
     columns = (frames["t_host_ns"], frames["id_flags"] & 0x1FFF_FFFF, map(bytes, frames["data"]))
-    assert found == list(zip(*columns, strict=True))
+    assert rows == list(zip(*columns, strict=True))
 
 
 def test_names_that_a_format_has_not_are_reported(tmp_path):
@@ -257,12 +257,12 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path):
     with Session.open(tmp_path / "x.mcap") as session:
         assert session.warnings == []
         for topic, way in (("/can0/from_can_bus", fr.DIR_RX), ("/can0/to_can_bus", fr.DIR_TX)):
-            table, own = session.table(topic), frames[frames["dir"] == way]
-            assert table.index.tolist() == own["t_host_ns"].tolist()
-            assert table["id"].tolist() == own["id_flags"].tolist()
-            assert table["dlc"].tolist() == own["dlc"].tolist()
+            table, of_way = session.table(topic), frames[frames["dir"] == way]
+            assert table.index.tolist() == of_way["t_host_ns"].tolist()
+            assert table["id"].tolist() == of_way["id_flags"].tolist()
+            assert table["dlc"].tolist() == of_way["dlc"].tolist()
             data = table[[f"data[{k}]" for k in range(8)]].to_numpy()
-            np.testing.assert_array_equal(data, own["data"])
+            np.testing.assert_array_equal(data, of_way["data"])
 
 
 # -- the command ------------------------------------------------------------------------------

@@ -59,14 +59,17 @@ def test_each_frame_holds_the_last_sample_and_its_time(made):
     episodes = pd.read_parquet(folder / "meta/episodes/chunk-000/file-000.parquet")
     assert report.facts["episodes"] == episodes["length"].tolist()
     for number, path in enumerate(runs):
-        own = frames[frames["episode_index"] == number]
-        assert own["frame_index"].tolist() == list(range(len(own)))
-        frame_ns = np.rint(np.arange(len(own)) * 1e9 / 30).astype(np.int64)
+        of_episode = frames[frames["episode_index"] == number]
+        assert of_episode["frame_index"].tolist() == list(range(len(of_episode)))
+        frame_ns = np.rint(np.arange(len(of_episode)) * 1e9 / 30).astype(np.int64)
         frame_ns += int(episodes["undulog/start_ns"][number])
         with Session.open(path) as session:
             starts = []
             for feature, topic in FEATURES.items():
-                values, times = np.stack(own[feature]), np.stack(own[f"sample_time.{feature}"])
+                values, times = (
+                    np.stack(of_episode[feature]),
+                    np.stack(of_episode[f"sample_time.{feature}"]),
+                )
                 assert (values.dtype, times.dtype) == (np.float32, np.int64)
                 for j, name in enumerate(NAMES):
                     signal = session.joints(topic).signal(name)
@@ -114,23 +117,25 @@ def test_statistics_are_those_of_the_frames(made):
             expected = getattr(np, key)(values, axis=0)
             np.testing.assert_allclose(stats[name][key], expected, rtol=1e-9)
         assert stats[name]["count"] == [len(frames)]
-        own = values[(frames["episode_index"] == 1).to_numpy()]
-        np.testing.assert_allclose(episodes[f"stats/{name}/mean"][1], own.mean(axis=0))
-        np.testing.assert_allclose(episodes[f"stats/{name}/q10"][1], np.quantile(own, 0.1, axis=0))
+        of_episode = values[(frames["episode_index"] == 1).to_numpy()]
+        np.testing.assert_allclose(episodes[f"stats/{name}/mean"][1], of_episode.mean(axis=0))
+        np.testing.assert_allclose(
+            episodes[f"stats/{name}/q10"][1], np.quantile(of_episode, 0.1, axis=0)
+        )
 
 
 def test_an_import_reads_the_frames_back(made, tmp_path):
     _, folder, _ = made
     frames = frames_of(folder)
     for number, report in enumerate(import_lerobot(folder, tmp_path / "back")):
-        own = frames[frames["episode_index"] == number]
+        of_episode = frames[frames["episode_index"] == number]
         with Session.open(report.output) as session:
             assert session.metadata["undulog"]["import.task"] == "wave"
             for feature, topic in FEATURES.items():
-                found = session.joints(topic)
-                assert found.names == NAMES
-                got = np.stack([found.signal(name).values for name in NAMES], axis=1)
-                np.testing.assert_array_equal(got, np.stack(own[feature]))  # bit for bit
+                series = session.joints(topic)
+                assert series.names == NAMES
+                got = np.stack([series.signal(name).values for name in NAMES], axis=1)
+                np.testing.assert_array_equal(got, np.stack(of_episode[feature]))  # bit for bit
 
 
 @pytest.mark.skipif(not G1.exists(), reason=f"the G1 data are not at {G1}")
@@ -141,10 +146,10 @@ def test_a_real_dataset_comes_back(tmp_path):
     frames = frames_of(tmp_path / "set")
     for number, path in enumerate(sorted((G1 / "data" / "chunk-000").iterdir())):
         original = pd.read_parquet(path)
-        own = frames[frames["episode_index"] == number]
-        assert len(own) == len(original) == report.facts["episodes"][number]
+        of_episode = frames[frames["episode_index"] == number]
+        assert len(of_episode) == len(original) == report.facts["episodes"][number]
         for name in (*FEATURES, "frame_index", "timestamp"):
-            np.testing.assert_array_equal(np.stack(own[name]), np.stack(original[name]))
+            np.testing.assert_array_equal(np.stack(of_episode[name]), np.stack(original[name]))
 
 
 def test_one_joint_is_a_plain_number(tmp_path, opened):

@@ -75,9 +75,9 @@ def test_each_episode_is_a_session(version, tmp_path):
             facts = session.metadata["undulog"]
             ids.add(session.session_id)
             for topic in ("/joint_commands", "/joint_states"):
-                found = session.joints(topic)
-                assert found.names == ("shoulder_pan", "elbow_flex")
-                pan = found.signal("shoulder_pan")
+                series = session.joints(topic)
+                assert series.names == ("shoulder_pan", "elbow_flex")
+                pan = series.signal("shoulder_pan")
                 np.testing.assert_array_equal(pan.values, values(k)[:, 0])
                 made = np.rint(np.arange(LENGTHS[k]) * 1e9 / FPS)
                 np.testing.assert_array_equal(pan.t_ns - RELATIVE_EPOCH_NS, made)
@@ -127,9 +127,9 @@ def test_a_humanoid(tmp_path, command):
     (report,) = import_lerobot(G1, tmp_path / "g1.mcap", episode=2)
     raw = pq.read_table(G1 / "data" / "chunk-000" / "episode_000002.parquet")
     with Session.open(report.output) as session:
-        found = session.joints("/joint_commands")
-        assert (len(found.names), found.names[0]) == (26, "kLeftShoulderPitch")
-        got = np.array([found.signal(name).values for name in found.names]).T
+        series = session.joints("/joint_commands")
+        assert (len(series.names), series.names[0]) == (26, "kLeftShoulderPitch")
+        got = np.array([series.signal(name).values for name in series.names]).T
     np.testing.assert_array_equal(got, np.array(raw["action"].to_pylist(), dtype=np.float32))
     answer = command("analyse", report.output).out
     assert "times made from fps = 30" in answer

@@ -62,8 +62,8 @@ def test_a_file_of_deeplabcut_opens_with_its_rate(tmp_path, command):
 def test_names_of_other_tools_are_read(tmp_path, command, x, y):
     angles, points = swimmer(2.0)
     table = {"time [s]": np.arange(angles.shape[1]) / FPS}
-    for name, (one, other) in zip(MARKERS, points, strict=True):
-        table |= {x.format(name): one, y.format(name): other}
+    for name, (xs, ys) in zip(MARKERS, points, strict=True):
+        table |= {x.format(name): xs, y.format(name): ys}
     pd.DataFrame(table).to_csv(tmp_path / "t.csv", index=False)
     command("import", tmp_path / "t.csv", "-o", tmp_path / "t.mcap")
     names, _, values, _ = joints_of(tmp_path / "t.mcap")
@@ -74,8 +74,8 @@ def test_names_of_other_tools_are_read(tmp_path, command, x, y):
 def test_numbered_points_and_a_column_of_frames(tmp_path, command):
     angles, points = swimmer(2.0)
     table = {"frame": np.arange(10, 10 + angles.shape[1])}
-    for k, (one, other) in enumerate(points, start=1):
-        table |= {f"x{k}": one, f"y{k}": other}
+    for k, (xs, ys) in enumerate(points, start=1):
+        table |= {f"x{k}": xs, f"y{k}": ys}
     pd.DataFrame(table).drop(index=5).to_csv(tmp_path / "t.csv", index=False)
     error = command("import", tmp_path / "t.csv", "-o", tmp_path / "t.mcap", code=1).err
     assert "--fps" in error

@@ -49,8 +49,8 @@ def group(kind, times, columns):
 
 
 def data_group(times, ids, data):
-    lengths = [len(each) for each in data]
-    cells = np.array([list(each.ljust(8, b"\xee")) for each in data], dtype=np.uint8)
+    lengths = [len(payload) for payload in data]
+    cells = np.array([list(payload.ljust(8, b"\xee")) for payload in data], dtype=np.uint8)
     columns = {
         "ID": (("<u4",), ids),
         "DLC": (("u1",), lengths),
@@ -64,10 +64,10 @@ def written(path, *groups, start=START, compression=0, ways=None):
     """``ways``: conversion of the directions, as loggers have it: numbers that stand for texts."""
     mdf = asammdf.MDF(version="4.10")
     mdf.header.start_time = start
-    for each in groups:
-        mdf.append(each)
-    for each in mdf.groups if ways else ():
-        channel = next(c for c in each.channels if c.name == "CAN_DataFrame.Dir")
+    for part in groups:
+        mdf.append(part)
+    for part in mdf.groups if ways else ():
+        channel = next(c for c in part.channels if c.name == "CAN_DataFrame.Dir")
         channel.conversion = asammdf.blocks.conversion_utils.from_dict(ways)
     mdf.save(path, compression=compression)
     mdf.close()
@@ -184,9 +184,9 @@ def test_the_start_of_the_measurement(start, truth_ns, tmp_path):
 
 
 def test_times_that_go_back_stay_in_their_order(tmp_path):
-    one = data_group([0.0, 2.0, 1.0, 3.0], [1, 2, 3, 4], [b""] * 4)
+    first = data_group([0.0, 2.0, 1.0, 3.0], [1, 2, 3, 4], [b""] * 4)
     other = data_group([1.5, 2.5], [5, 6], [b"", b""])
-    frames, *_ = read(written(tmp_path / "log.mf4", one, other))
+    frames, *_ = read(written(tmp_path / "log.mf4", first, other))
     assert frames["id_flags"].tolist() == [1, 5, 2, 3, 6, 4]
 
 
@@ -259,10 +259,10 @@ def test_a_file_that_its_logger_did_not_finish(tmp_path):
     struct.pack_into("<H", data, 60, 0b101)
     data[:8] = b"UnFinMF "
     path.write_bytes(data)
-    found, _, log = read(path)
-    assert found["id_flags"].tolist() == list(range(500))
-    assert (found["t_host_ns"] - START_NS).tolist() == [1_000_000 * i for i in range(500)]
-    assert found["data"][:, 0].tolist() == [i % 256 for i in range(500)]
+    read_back, _, log = read(path)
+    assert read_back["id_flags"].tolist() == list(range(500))
+    assert (read_back["t_host_ns"] - START_NS).tolist() == [1_000_000 * i for i in range(500)]
+    assert read_back["data"][:, 0].tolist() == [i % 256 for i in range(500)]
     assert log.problems == []
     assert path.read_bytes() == data
 
@@ -293,7 +293,9 @@ def test_data_of_varying_length(text, tmp_path):
                 whole[at + 24 + 8 * links + 2] = 10
         path.write_bytes(whole)
         frames, *_ = read(path)
-        assert [bytes(row) for row in frames["data"]] == [each.ljust(8, b"\0") for each in data]
+        assert [bytes(row) for row in frames["data"]] == [
+            payload.ljust(8, b"\0") for payload in data
+        ]
         assert frames["dlc"].tolist() == lengths.tolist()
     else:
         with pytest.raises(ImportFormatError, match=r"DataBytes are of type .*, not bytes"):

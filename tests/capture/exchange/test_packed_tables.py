@@ -101,8 +101,8 @@ def test_a_pickle_of_many_marks_and_tuples(tmp_path):
 
 
 def test_thousands_of_names_of_one_storage(tmp_path):
-    one = tensor("s", 200, (200,), (1,))
-    pickle = b"}(" + b"".join(b"Vt%d\n" % k + one for k in range(2000)) + b"u"
+    entry = tensor("s", 200, (200,), (1,))
+    pickle = b"}(" + b"".join(b"Vt%d\n" % k + entry for k in range(2000)) + b"u"
     path = of_bytes(tmp_path / "x.pt", tensors(pickle, s=T))
     table = open_table(path)
     assert len(table.columns) == 2000
@@ -145,9 +145,9 @@ def test_a_long_table_in_any_order(tmp_path):
     text = "\n".join(["t,joint,angle", *(f"{int(t)},{int(k)},{q:.9f}" for t, k, q in rows)])
     path = of_bytes(tmp_path / "x.csv", text.encode())
     import_tables(open_tables(path), tmp_path / "x.mcap", units={"time": "s"})
-    found = [message for *_, message in decoded_of(tmp_path / "x.mcap", ["/joint_states"])]
-    in_order = np.argsort(found[0].name)
-    angles = np.array([message.position for message in found])[:, in_order]
+    messages = [message for *_, message in decoded_of(tmp_path / "x.mcap", ["/joint_states"])]
+    in_order = np.argsort(messages[0].name)
+    angles = np.array([message.position for message in messages])[:, in_order]
     expected = np.sin(np.arange(20_000)[:, None] + np.arange(3))
     assert angles == pytest.approx(expected, abs=1e-8)
 
@@ -229,5 +229,5 @@ def test_one_joint_has_no_vectors(tmp_path):
     """LeRobot writes a feature of one element as plain numbers."""
     cells = [k / 20 for k in range(20)]
     import_lerobot(dataset(tmp_path, width=1, action=cells), tmp_path / "x.mcap")
-    found = decoded_of(tmp_path / "x.mcap", ["/joint_commands"])
-    assert [message.position for *_, message in found] == [[cell] for cell in cells]
+    messages = decoded_of(tmp_path / "x.mcap", ["/joint_commands"])
+    assert [message.position for *_, message in messages] == [[cell] for cell in cells]

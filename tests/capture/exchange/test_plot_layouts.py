@@ -63,9 +63,9 @@ def test_each_path_of_foxglove_leads_to_its_joint(run, tmp_path, command):
         panel = layout["configById"][name]
         assert panel["title"] == f"{joint} [rad]"
         matches = [FOXGLOVE.fullmatch(path["value"]) for path in panel["paths"]]
-        assert [each["topic"] for each in matches] == ["/joint_commands", "/joint_states"]
-        for each in matches:
-            assert first[each["topic"]].name[int(each["place"])] == joint
+        assert [match["topic"] for match in matches] == ["/joint_commands", "/joint_states"]
+        for match in matches:
+            assert first[match["topic"]].name[int(match["place"])] == joint
 
 
 def test_plotjuggler_has_a_plot_for_each_joint(run, tmp_path, opened):
@@ -115,7 +115,7 @@ def test_odd_names_and_topics(tmp_path):
     report = export_plotjuggler_layout(tmp_path / "run.mcap", tmp_path / "x.xml", topics=["/a b/x"])
     assert report.facts["joints"] == [names[0], names[2]]
     assert report.warnings[-1].startswith("names that XML can't hold, left out")
-    curves = [each.get("name") for each in ET.parse(tmp_path / "x.xml").getroot().iter("curve")]
+    curves = [curve.get("name") for curve in ET.parse(tmp_path / "x.xml").getroot().iter("curve")]
     assert curves == [f"/a b/x/{name}/position" for name in report.facts["joints"]]
     export_foxglove_layout(tmp_path / "run.mcap", tmp_path / "x.json", topics=["/a b/x"])
     layout = json.loads((tmp_path / "x.json").read_text())

@@ -75,7 +75,7 @@ def test_a_topic_whose_last_message_stays_valid_is_offered_so(bag):
             connection.topic: connection.ext.offered_qos_profiles
             for connection in reader.connections
         }
-    assert [each.durability for each in offered["/gait/mode"]] == [QosDurability.TRANSIENT_LOCAL]
+    assert [offer.durability for offer in offered["/gait/mode"]] == [QosDurability.TRANSIENT_LOCAL]
     assert offered["/joint_states"] == []
 
 
@@ -90,8 +90,8 @@ def test_the_bag_is_read_as_the_session(bag, tmp_path):
 
 def records_of(path):
     with RawLog(path) as log:
-        own = [each for each in log.metadata if each.name != EDIT_RECORD]
-        return own, log.attachments
+        records = [record for record in log.metadata if record.name != EDIT_RECORD]
+        return records, log.attachments
 
 
 def test_an_exported_session_comes_back_bit_for_bit(bag, tmp_path, command, report_of):
@@ -103,10 +103,10 @@ def test_an_exported_session_comes_back_bit_for_bit(bag, tmp_path, command, repo
     assert "exported by undulog, is copied as it is" in report["notes"][0]
     assert sorted(messages_of(back)) == sorted(messages_of(session))
     assert records_of(back) == records_of(session)
-    with Session.open(back) as one, Session.open(session) as other:
-        assert (one.session_id, one.start_ns) == (other.session_id, other.start_ns)
+    with Session.open(back) as returned, Session.open(session) as other:
+        assert (returned.session_id, returned.start_ns) == (other.session_id, other.start_ns)
         for topic in ("/joint_states", "/joint_commands"):
-            got, expected = one.joints(topic), other.joints(topic)
+            got, expected = returned.joints(topic), other.joints(topic)
             np.testing.assert_array_equal(got.t_ns, expected.t_ns)
             np.testing.assert_array_equal(got.values, expected.values)
     assert "exists already" in command("import", folder, "-o", back, code=2).err
@@ -121,7 +121,7 @@ def test_an_edit_keeps_the_chunks_of_the_contract(bag, tmp_path, command):
     back, part = tmp_path / "back.mcap", tmp_path / "part.mcap"
     command("import", bag[0], "-o", back)
     command("log", "cut", back, "--start", 1, "-o", part)
-    assert [one for path in (back, part) for one in check_contract(path)] == []
+    assert [violation for path in (back, part) for violation in check_contract(path)] == []
 
 
 def write_mcap(path, channels):

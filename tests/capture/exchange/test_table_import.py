@@ -32,11 +32,11 @@ def imported(source, tmp_path, *, commands=None, **options):
 
 def joints(tmp_path, topic="/joint_states", field="position"):
     with Session.open(tmp_path / "run.mcap") as session:
-        found = session.joints(topic, field)
+        series = session.joints(topic, field)
         return (
-            found.names,
-            np.array([found.signal(n).values for n in found.names]).T,
-            [found.signal(n).t_ns - RELATIVE_EPOCH_NS for n in found.names],
+            series.names,
+            np.array([series.signal(n).values for n in series.names]).T,
+            [series.signal(n).t_ns - RELATIVE_EPOCH_NS for n in series.names],
         )
 
 
@@ -58,8 +58,8 @@ def assert_all(tmp_path, *, names=("joint1", "joint2", "joint3"), velocity=V):
     ):
         if values is None:
             continue
-        found, got, stamps = joints(tmp_path, topic, field)
-        assert found == names
+        columns, got, stamps = joints(tmp_path, topic, field)
+        assert columns == names
         np.testing.assert_array_equal(got, values)
         np.testing.assert_array_equal(stamps, [t_ns] * 3)
 

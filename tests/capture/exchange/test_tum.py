@@ -50,9 +50,9 @@ def test_the_base_of_a_session(tmp_path, report_of):
     line = ("log", "export", tmp_path / "run.mcap", "--to", "tum", "-o", tmp_path / "base.tum")
     report = report_of(*line)
     assert [report[key] for key in ("poses", "frame", "parent")] == [50, "base", "map"]
-    comments, found, numbers = read(tmp_path / "base.tum")
+    comments, stamps, numbers = read(tmp_path / "base.tum")
     assert comments == ["# pose of base in map, from /odom", "# timestamp tx ty tz qx qy qz qw"]
-    assert found == times
+    assert stamps == times
     np.testing.assert_array_equal(numbers, np.hstack([positions, turns]))  # bit for bit
 
 
@@ -74,8 +74,8 @@ def test_what_is_no_pose_is_left_out_and_times_are_sorted(tmp_path):
     write_odometry(tmp_path / "run.mcap", times, positions, turns)
     report = export_tum(tmp_path / "run.mcap", tmp_path / "x.tum")
     assert report.warnings[-1].startswith("2 poses left out: not finite, or")
-    _, found, numbers = read(tmp_path / "x.tum")
-    assert found == [T0 + 5, T0 + 9]
+    _, stamps, numbers = read(tmp_path / "x.tum")
+    assert stamps == [T0 + 5, T0 + 9]
     np.testing.assert_array_equal(numbers[:, :3], positions[[3, 0]])
 
 
@@ -113,10 +113,10 @@ def test_a_link_of_transforms_that_change_from_message_to_message(tmp_path, comm
     messages = []
     for k in range(40):
         t_ns = T0 + k * 1_000
-        own = [transform(t_ns, "base", f"link{k % 2}", positions[k], turns[k])]
+        transforms = [transform(t_ns, "base", f"link{k % 2}", positions[k], turns[k])]
         if k % 3 == 0:
-            own.insert(0, transform(t_ns, "map", "base", positions[k], turns[k]))
-        messages.append(("/tf", t_ns + 77, {"transforms": own}))
+            transforms.insert(0, transform(t_ns, "map", "base", positions[k], turns[k]))
+        messages.append(("/tf", t_ns + 77, {"transforms": transforms}))
     write_foreign(tmp_path / "run.mcap", messages, TF)
     report = export_tum(tmp_path / "run.mcap", tmp_path / "x.tum", frame="link1")
     assert (report.facts["parent"], report.facts["topic"]) == ("base", "/tf")

@@ -60,11 +60,11 @@ def assert_same_samples(back, session):
             got = back.joints(topic, name)
             assert (set(got.names), got.unit) == (set(expected.names), expected.unit)
             for joint in expected.names:
-                one, other = expected.signal(joint), got.signal(joint)
-                known = ~np.isnan(one.values)
-                np.testing.assert_array_equal(other.t_ns, one.t_ns[known])
-                assert other.values.tobytes() == one.values[known].tobytes()  # also -0.0
-                compared += len(one.t_ns)
+                original, other = expected.signal(joint), got.signal(joint)
+                finite = ~np.isnan(original.values)
+                np.testing.assert_array_equal(other.t_ns, original.t_ns[finite])
+                assert other.values.tobytes() == original.values[finite].tobytes()  # also -0.0
+                compared += len(original.t_ns)
     assert compared
 
 
@@ -101,10 +101,10 @@ def test_a_column_holds_the_samples_of_a_joint_at_their_times(suffix, staggered,
     assert table["t_ns"].dtype == np.int64
     assert table["t_ns"].is_monotonic_increasing
     np.testing.assert_array_equal(table["time [s]"], (table["t_ns"] - T0) / 1e9)
-    own = table[["t_ns", "leftKnee.effort [N m]"]].dropna()
+    column = table[["t_ns", "leftKnee.effort [N m]"]].dropna()
     expected = opened(staggered).joints("/joint_states", "effort").signal("leftKnee")
-    np.testing.assert_array_equal(own["t_ns"], expected.t_ns)
-    np.testing.assert_array_equal(own["leftKnee.effort [N m]"], expected.values)
+    np.testing.assert_array_equal(column["t_ns"], expected.t_ns)
+    np.testing.assert_array_equal(column["leftKnee.effort [N m]"], expected.values)
     (warning,) = report.warnings
     assert "% of the cells are empty: joints were sampled at times of their own" in warning
 
@@ -227,5 +227,5 @@ def test_a_table_with_many_sets_of_joints_is_imported_whole(tmp_path):
     with Session.open(tmp_path / "x.mcap") as session:
         for k in range(12):
             got = session.joints("/joint_states").signal(f"j{k}")
-            known = ~np.isnan(got.values)
-            np.testing.assert_array_equal(got.values[known], cells[~np.isnan(cells[:, k]), k])
+            finite = ~np.isnan(got.values)
+            np.testing.assert_array_equal(got.values[finite], cells[~np.isnan(cells[:, k]), k])

@@ -55,9 +55,9 @@ def test_a_weak_joint_is_named_with_its_gain():
 
 def test_two_late_joints_are_both_apart_and_of_three_the_others():
     apart = judge(arm(lag_s=LAG_S + 0.1 * np.array([0, 0, 1, 0, 1]))).apart
-    assert [each.joint for each in apart] == ["j2", "j4"]
+    assert [joint.joint for joint in apart] == ["j2", "j4"]
     apart = judge(arm(lag_s=LAG_S + 0.1 * np.array([0, 1, 1, 0, 1]))).apart
-    assert [each.joint for each in apart] == ["j0", "j3"]
+    assert [joint.joint for joint in apart] == ["j0", "j3"]
 
 
 def test_three_joints_are_too_few():

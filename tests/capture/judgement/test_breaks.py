@@ -31,31 +31,31 @@ def design(rows, q, cut):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_break_is_that_of_least_squares_with_a_column_of_its_own(seed):
     rows = columns(np.random.default_rng(seed))
-    found = breaks_of(moments(rows))
+    breaks = breaks_of(moments(rows))
     for q in range(TERMS):
         for cut in range(BLOCKS - 1):
             x = design(rows, q, cut)
             fitted, squares, *_ = np.linalg.lstsq(x, rows[TERMS], rcond=None)
             without = np.linalg.lstsq(x[:, :-1], rows[TERMS], rcond=None)[1]
-            assert found.change[q, cut] == pytest.approx(fitted[-1], rel=1e-6, abs=1e-9)
-            assert found.before[q, cut] == pytest.approx(fitted[q], rel=1e-6, abs=1e-9)
-            assert found.left[q, cut] == pytest.approx(squares[0], rel=1e-9)
-            assert found.drop[q, cut] == pytest.approx(without[0] - squares[0], abs=1e-6)
+            assert breaks.change[q, cut] == pytest.approx(fitted[-1], rel=1e-6, abs=1e-9)
+            assert breaks.before[q, cut] == pytest.approx(fitted[q], rel=1e-6, abs=1e-9)
+            assert breaks.left[q, cut] == pytest.approx(squares[0], rel=1e-9)
+            assert breaks.drop[q, cut] == pytest.approx(without[0] - squares[0], abs=1e-6)
 
 
 def test_the_error_of_a_break_is_that_of_sums_over_blocks():
     rows = columns(np.random.default_rng(7))
-    found = breaks_of(moments(rows))
+    breaks = breaks_of(moments(rows))
     q, cut = 1, 5
     x = design(rows, q, cut)
     left = rows[TERMS] - x @ np.linalg.lstsq(x, rows[TERMS], rcond=None)[0]
     free = x[:, -1] - x[:, :-1] @ np.linalg.lstsq(x[:, :-1], x[:, -1], rcond=None)[0]
     scores, power = ((free * part).reshape(BLOCKS, WIDTH).sum(axis=1) for part in (left, free))
     blocks = power.sum() ** 2 / (power**2).sum()
-    assert found.freedom[q, cut] == pytest.approx(blocks - 2)
+    assert breaks.freedom[q, cut] == pytest.approx(blocks - 2)
     rho = max(scores[1:] @ scores[:-1] / (scores @ scores), 0.0)
     square = scores @ scores * (1 + rho) / (1 - rho) * blocks / (blocks - 2)
-    assert found.error[q, cut] == pytest.approx(np.sqrt(square) / power.sum())
+    assert breaks.error[q, cut] == pytest.approx(np.sqrt(square) / power.sum())
 
 
 def test_the_error_holds_the_change_of_noise_that_differs_from_block_to_block():
@@ -65,18 +65,18 @@ def test_the_error_holds_the_change_of_noise_that_differs_from_block_to_block():
         rng = np.random.default_rng(1000 + seed)
         rows = columns(rng)
         rows[TERMS] *= np.repeat(rng.choice([1.0, 1.0, 5.0], BLOCKS), WIDTH)
-        found = breaks_of(moments(rows))
-        beyond += abs(found.change[0, 5]) > 2.2 * found.error[0, 5]
+        breaks = breaks_of(moments(rows))
+        beyond += abs(breaks.change[0, 5]) > 2.2 * breaks.error[0, 5]
     assert beyond <= 0.05 * draws + 3 * np.sqrt(0.05 * draws)
 
 
 def test_a_term_that_never_moves_has_no_break():
     rows = columns(np.random.default_rng(3))
     rows[1:TERMS] = 0.0
-    found = breaks_of(moments(rows))
-    assert (found.freedom[1:] < 1).all()
-    assert (found.change[1:] == 0).all()
-    assert np.isfinite(found.error).all()
+    breaks = breaks_of(moments(rows))
+    assert (breaks.freedom[1:] < 1).all()
+    assert (breaks.change[1:] == 0).all()
+    assert np.isfinite(breaks.error).all()
 
 
 T = np.arange(0.0, 90.0, 0.02)
@@ -85,7 +85,7 @@ MOVES_S = np.arange(3.0, 86.0, 4.1)
 
 def work(*, gain=0.0, offset=0.0, late_s=0.0, from_s=37.0, joints=3, seed=0):
     """Return an arm that goes from place to place, of which the first joint changes at a time."""
-    rng, found = np.random.default_rng(seed), []
+    rng, recorded = np.random.default_rng(seed), []
     for k in range(joints):
         places = rng.uniform(-0.8, 0.8, len(MOVES_S))
 
@@ -98,10 +98,10 @@ def work(*, gain=0.0, offset=0.0, late_s=0.0, from_s=37.0, joints=3, seed=0):
         # It rests where friction lets it.
         rest = np.interp(T, MOVES_S, rng.normal(scale=0.006, size=len(MOVES_S)))
         noise = rng.normal(scale=0.001, size=T.size)
-        found.append(
+        recorded.append(
             RecordedJoint(f"j{k}", Samples(T, path(T)), Samples(T, position + rest + noise))
         )
-    return found
+    return recorded
 
 
 @pytest.mark.parametrize(
@@ -115,11 +115,11 @@ def work(*, gain=0.0, offset=0.0, late_s=0.0, from_s=37.0, joints=3, seed=0):
     ],
 )
 def test_a_change_in_work_of_few_motions_has_its_size_and_time(joints, quantity, size, change):
-    (found,) = judge(work(**change, joints=joints)).changes
-    assert (found.joint, found.quantity) == ("j0", quantity)
-    assert found.change == pytest.approx(size, rel=0.15)
-    assert found.onset_s[0] - 4 <= 37.0 <= found.onset_s[1] + 4
-    assert found.until_s is None
+    (stated,) = judge(work(**change, joints=joints)).changes
+    assert (stated.joint, stated.quantity) == ("j0", quantity)
+    assert stated.change == pytest.approx(size, rel=0.15)
+    assert stated.onset_s[0] - 4 <= 37.0 <= stated.onset_s[1] + 4
+    assert stated.until_s is None
 
 
 @pytest.mark.parametrize("joints", [1, 3])
@@ -128,8 +128,8 @@ def test_work_without_a_change_has_none(joints):
 
 
 def test_the_half_width_of_a_gain_is_relative_as_the_gain_is():
-    (found,) = judge(work(gain=-0.25)).changes
+    (stated,) = judge(work(gain=-0.25)).changes
     (other,) = judge(work(gain=0.25)).changes
     # 0.95 before; the same step from 0.95 up and down, in units of what was before.
-    assert found.change == pytest.approx(-other.change, rel=0.05)
-    assert found.half_width < 0.1 * abs(found.change)
+    assert stated.change == pytest.approx(-other.change, rel=0.05)
+    assert stated.half_width < 0.1 * abs(stated.change)

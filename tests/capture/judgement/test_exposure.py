@@ -15,21 +15,21 @@ T = np.arange(0.0, 30.0, 0.02)
 
 def joints(amplitude_rad, still, noise_rad=0.001):
     rng = np.random.default_rng(4)
-    found = []
+    recorded = []
     for k in range(6):
         command = amplitude_rad * np.sin(2 * np.pi * 0.7 * T - 0.5 * k)
         late = amplitude_rad * np.sin(2 * np.pi * 0.7 * (T - 0.05) - 0.5 * k)
         position = (0 if k in still else 1) * late + noise_rad * rng.normal(size=T.size)
-        found.append(RecordedJoint(f"j{k}", Samples(T, command), Samples(T, position)))
-    return found
+        recorded.append(RecordedJoint(f"j{k}", Samples(T, command), Samples(T, position)))
+    return recorded
 
 
 @pytest.mark.parametrize("size", [2, 3, 7, 64, 100])
 def test_ranges_of_windows_are_those_of_each_window(size):
     values = np.random.default_rng(size).normal(size=100)
-    (found,) = window_ranges(values, [size])
+    (ranges,) = window_ranges(values, [size])
     expected = [np.ptp(values[k : k + size]) for k in range(100 - size + 1)]
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(ranges, expected)
 
 
 def test_windows_cover_their_samples():
@@ -84,14 +84,14 @@ def test_a_soft_joint_rests_off_and_is_not_accused():
 
 def late_by_half_a_cycle():
     """Joints that stand until their commands reach them, half a cycle late."""
-    found = []
+    recorded = []
     for k in range(6):
         phase = 2 * np.pi * 1.2 * T - 0.5 * k
         position = np.where(T < 0.5 / 1.2, np.sin(-0.5 * k), np.sin(phase - np.pi))
         noise = 0.001 * np.random.default_rng(k).normal(size=T.size)
         command = Samples(T, 0.15 * np.sin(phase))
-        found.append(RecordedJoint(f"j{k}", command, Samples(T, 0.12 * position + noise)))
-    return found
+        recorded.append(RecordedJoint(f"j{k}", command, Samples(T, 0.12 * position + noise)))
+    return recorded
 
 
 def test_joints_that_are_late_by_half_a_cycle_do_not_stand_at_the_beginning():

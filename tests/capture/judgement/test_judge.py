@@ -85,7 +85,7 @@ def test_a_vibration_near_the_limit_of_the_sampling_is_no_noise(chain):
     """Its turning points lie far from the running median of a few samples."""
     burst = np.exp(-(((chain.t[:, None] - [3.0, 6.0, 9.0, 12.0]) / 0.15) ** 2)).sum(1)
     chain.position[BROKEN] += 0.6 * burst * np.sin(2 * np.pi * 9.3 * chain.t)
-    assert "noisy_sensor" not in {kind for one in chain.judged().values() for kind in one.kinds}
+    assert "noisy_sensor" not in {kind for fault in chain.judged().values() for kind in fault.kinds}
 
 
 @pytest.mark.nightly
@@ -121,12 +121,12 @@ def test_a_noisy_coarse_encoder_repeats_values_by_chance(seeds):
 
 def test_a_jam_is_named_with_its_time_and_all_kinds_that_fit(chain):
     jam(chain)
-    found = chain.judged("velocity")
-    assert list(found) == ["j4"]
-    assert found["j4"].since_s == pytest.approx(7.4, abs=0.3)
-    assert found["j4"].until_s is None
-    assert {"jammed", "frozen_sensor"} <= set(found["j4"].kinds)
-    assert found["j4"].about == "mechanics or sensor"
+    faults = chain.judged("velocity")
+    assert list(faults) == ["j4"]
+    assert faults["j4"].since_s == pytest.approx(7.4, abs=0.3)
+    assert faults["j4"].until_s is None
+    assert {"jammed", "frozen_sensor"} <= set(faults["j4"].kinds)
+    assert faults["j4"].about == "mechanics or sensor"
 
 
 @pytest.mark.parametrize(
@@ -143,8 +143,8 @@ def test_effort_or_a_second_sensor_exclude_kinds_of_a_jam(chain, channel, exclud
 def test_a_frozen_sensor_is_decided_by_any_other_channel(chain, channel):
     later = chain.t > 7.4
     chain.position[BROKEN, later] = chain.position[BROKEN, ~later][-1]
-    found = chain.judged(channel, outside=["velocity", "effort"])["j4"]
-    assert found.kinds == ("frozen_sensor",)
+    fault = chain.judged(channel, outside=["velocity", "effort"])["j4"]
+    assert fault.kinds == ("frozen_sensor",)
 
 
 def test_effort_of_the_servos_own_loop_tells_no_frozen_sensor_from_a_jam(chain):
@@ -156,10 +156,10 @@ def test_effort_of_the_servos_own_loop_tells_no_frozen_sensor_from_a_jam(chain):
 def test_a_dead_joint_has_no_effort(chain):
     chain.position[BROKEN] = chain.rng.normal(0, NOISE, chain.t.size)
     chain.velocity[BROKEN] = chain.effort[BROKEN] = 0.0
-    found = chain.judged("velocity")["j4"]
-    assert found.since_s is None
-    assert {"dead", "jammed"} <= set(found.kinds)
-    assert "frozen_sensor" not in found.kinds  # new noise in each sample
+    fault = chain.judged("velocity")["j4"]
+    assert fault.since_s is None
+    assert {"dead", "jammed"} <= set(fault.kinds)
+    assert "frozen_sensor" not in fault.kinds  # new noise in each sample
     assert chain.judged("effort")["j4"].kinds == ("dead",)
 
 
@@ -177,9 +177,9 @@ def test_holds_again_and_again_are_intermittent(chain):
     for start in np.arange(1.0, 14.0, 2.5):
         held = (chain.t > start) & (chain.t < start + 0.5)
         chain.position[BROKEN, held] = chain.position[BROKEN, held][0]
-    found = chain.judged()["j4"]
-    assert found.kinds[0] == "intermittent"
-    assert 0.02 < found.share < 0.4
+    fault = chain.judged()["j4"]
+    assert fault.kinds[0] == "intermittent"
+    assert 0.02 < fault.share < 0.4
 
 
 @pytest.mark.parametrize(
@@ -191,9 +191,9 @@ def test_holds_again_and_again_are_intermittent(chain):
 )
 def test_faults_of_a_sensor(chain, change, kind):
     chain.position[BROKEN] = change(chain.position[BROKEN], chain.t, chain.rng)
-    found = chain.judged()
-    assert list(found) == ["j4"]
-    assert kind in found["j4"].kinds
+    faults = chain.judged()
+    assert list(faults) == ["j4"]
+    assert kind in faults["j4"].kinds
 
 
 @pytest.mark.parametrize(
@@ -208,33 +208,33 @@ def test_a_change_is_no_fault_and_has_its_time(chain, change, quantity, size):
     chain.position[BROKEN] = change(chain.position[BROKEN], chain.t, chain.rng)
     judgement = judge(chain.motions())
     assert judgement.faults == ()
-    (found,) = judgement.changes
-    assert (found.joint, found.quantity, found.until_s) == ("j4", quantity, None)
-    assert found.change == pytest.approx(size, rel=0.1)
-    assert found.onset_s[0] < 8 < found.onset_s[1]
+    (stated,) = judgement.changes
+    assert (stated.joint, stated.quantity, stated.until_s) == ("j4", quantity, None)
+    assert stated.change == pytest.approx(size, rel=0.1)
+    assert stated.onset_s[0] < 8 < stated.onset_s[1]
 
 
 def test_a_noisier_sensor_has_its_time(chain):
     chain.position[BROKEN] += 0.05 * chain.rng.normal(size=chain.t.size) * (chain.t > 8)
-    (found,) = judge(chain.motions()).changes
-    assert (found.joint, found.quantity) == ("j4", "noise")
-    assert found.onset_s[0] < 8 < found.onset_s[1]
+    (stated,) = judge(chain.motions()).changes
+    assert (stated.joint, stated.quantity) == ("j4", "noise")
+    assert stated.onset_s[0] < 8 < stated.onset_s[1]
 
 
 def test_a_vibration_is_motion_besides_the_command(chain):
     chain.position[BROKEN] += 0.1 * np.sin(2 * np.pi * 6.1 * chain.t)
-    (found,) = judge(chain.motions()).extra
-    assert found.joint == "j4"
-    assert found.frequency_hz == pytest.approx(6.1, abs=0.1)
-    assert found.amplitude_rad == pytest.approx(0.1, rel=0.1)
+    (line,) = judge(chain.motions()).extra
+    assert line.joint == "j4"
+    assert line.frequency_hz == pytest.approx(6.1, abs=0.1)
+    assert line.amplitude_rad == pytest.approx(0.1, rel=0.1)
 
 
 def test_a_line_at_half_the_pace_of_few_cycles_is_told_from_a_drift(chain):
     chain.position[BROKEN] += 0.05 * np.sin(OMEGA / 2 * chain.t)
-    (found,) = judge(chain.motions()).extra
-    assert found.joint == "j4"
-    assert found.frequency_hz == pytest.approx(OMEGA / 4 / np.pi, abs=0.02)
-    assert found.amplitude_rad == pytest.approx(0.05, rel=0.1)
+    (line,) = judge(chain.motions()).extra
+    assert line.joint == "j4"
+    assert line.frequency_hz == pytest.approx(OMEGA / 4 / np.pi, abs=0.02)
+    assert line.amplitude_rad == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.parametrize("noisy", [False, True])
@@ -243,9 +243,9 @@ def test_a_vibration_larger_than_the_motion_is_no_noise(chain, noisy):
     chain.position *= 0.1
     line = 0.06 * np.sin(2 * np.pi * 6.1 * chain.t)
     chain.position[BROKEN] += chain.rng.permutation(line) if noisy else line
-    found = judge(chain.motions())
-    assert [fault.joint for fault in found.faults] == ["j4"] * noisy
-    assert [line.joint for line in found.extra] == ["j4"] * (not noisy)
+    judgement = judge(chain.motions())
+    assert [fault.joint for fault in judgement.faults] == ["j4"] * noisy
+    assert [line.joint for line in judgement.extra] == ["j4"] * (not noisy)
 
 
 def test_a_joint_that_is_dead_at_another_angle_does_not_vibrate():
@@ -265,32 +265,32 @@ def test_half_the_pace_of_seven_cycles_is_no_drift_where_like_joints_lack_it(cha
     count = int(cycles * 2 * np.pi / OMEGA * RATE)
     chain.t = chain.t[:count]
     chain.command, chain.position = chain.command[:, :count], chain.position[:, :count]
-    (found,) = judge(chain.motions()).extra
-    assert (found.joint, found.frequency_hz) == ("j4", pytest.approx(OMEGA / 4 / np.pi, abs=0.03))
+    (line,) = judge(chain.motions()).extra
+    assert (line.joint, line.frequency_hz) == ("j4", pytest.approx(OMEGA / 4 / np.pi, abs=0.03))
 
 
 def test_a_vibration_of_a_part_of_the_record_has_its_own_amplitude(chain):
     chain.position[BROKEN] += 0.02 * np.sin(2 * np.pi * 5.3 * chain.t) * (chain.t < 9)
-    found = judge(chain.motions())
-    stated = [each.joint for each in (*found.extra, *found.changes)]
+    judgement = judge(chain.motions())
+    stated = [finding.joint for finding in (*judgement.extra, *judgement.changes)]
     assert stated
     assert {*stated} == {"j4"}
-    for each in found.extra:
-        assert each.amplitude_rad == pytest.approx(0.02, rel=0.1)
+    for line in judgement.extra:
+        assert line.amplitude_rad == pytest.approx(0.02, rel=0.1)
 
 
 def test_more_noise_tells_less_of_gain_and_lag(chain):
     later = chain.t > 7
     chain.position[BROKEN] += 0.04 * chain.rng.normal(size=chain.t.size) * later
-    (found,) = judge(chain.motions()).changes
-    assert (found.joint, found.quantity) == ("j4", "noise")
+    (stated,) = judge(chain.motions()).changes
+    assert (stated.joint, stated.quantity) == ("j4", "noise")
 
 
 def test_a_zero_that_drifts_is_no_gain(chain):
     chain.position[BROKEN] += 0.12 * (chain.t / chain.t[-1] - 0.5)
-    found = judge(chain.motions())
-    assert found.apart == found.faults == ()
-    (change,) = found.changes
+    judgement = judge(chain.motions())
+    assert judgement.apart == judgement.faults == ()
+    (change,) = judgement.changes
     assert (change.joint, change.quantity) == ("j4", "drift")
     assert change.change == pytest.approx(0.12, rel=0.1)
 
@@ -301,14 +301,14 @@ def test_two_kinds_of_servos_are_no_reason_to_doubt_the_names():
     rear = np.arange(15) > 6
     late = GAIN * 0.4 * np.sin(OMEGA * chain.t - 2 * np.pi / 15 * np.arange(15)[:, None] - 3 * LAG)
     chain.position[rear] = 0.95 * late[rear]
-    found = judge(chain.motions())
-    assert (found.naming, found.faults) == ("", ())
+    judgement = judge(chain.motions())
+    assert (judgement.naming, judgement.faults) == ("", ())
 
 
 def test_swapped_cables_name_both(chain):
     chain.position[[3, 4]] = chain.position[[4, 3]]
-    found = chain.judged()
-    assert {name: fault.kinds for name, fault in found.items()} == {
+    faults = chain.judged()
+    assert {name: fault.kinds for name, fault in faults.items()} == {
         "j4": ("swapped",),
         "j5": ("swapped",),
     }
@@ -318,8 +318,8 @@ def test_what_all_joints_do_together_is_no_joint_s_fault(chain):
     stopped = (chain.t > 6) & (chain.t < 8)
     first = int(np.argmax(stopped))
     chain.position[:, stopped] = chain.position[:, first : first + 1]
-    found = chain.judged()
-    assert not found or len(found) == 9
+    faults = chain.judged()
+    assert not faults or len(faults) == 9
 
 
 def test_a_pause_of_the_bus_in_which_a_driver_repeats_accuses_nobody(chain):
@@ -370,6 +370,6 @@ def test_a_tooth_that_slips_is_seen_in_a_small_motion():
     chain.command *= 0.05
     chain.position *= 0.05
     chain.position[BROKEN] += 0.3 * (chain.t > 9)
-    (found,) = judge(chain.motions()).changes
-    assert (found.joint, found.quantity) == ("j4", "offset")
-    assert found.change == pytest.approx(0.3, rel=0.02)
+    (stated,) = judge(chain.motions()).changes
+    assert (stated.joint, stated.quantity) == ("j4", "offset")
+    assert stated.change == pytest.approx(0.3, rel=0.02)

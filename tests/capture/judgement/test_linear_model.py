@@ -52,18 +52,18 @@ def test_a_sound_servo_is_not_named_though_its_lag_passes_half_a_turn(name, join
 @pytest.mark.parametrize("name", SOME)
 def test_an_inverted_joint_is_named(name):
     command = COMMANDS[name]
-    found = judged(command, -response(command), response(command), response(command))
-    assert list(found) == ["j1"]
-    assert found["j1"].kinds == ("inverted", "inverted_sensor")
+    faults = judged(command, -response(command), response(command), response(command))
+    assert list(faults) == ["j1"]
+    assert faults["j1"].kinds == ("inverted", "inverted_sensor")
 
 
 @pytest.mark.parametrize("name", SOME)
 def test_a_joint_that_stands_is_named(name):
     command = COMMANDS[name]
     still = 0.001 * np.random.default_rng(2).normal(size=T.size)
-    found = judged(command, response(command), still, response(command))
-    assert list(found) == ["j2"]
-    assert "dead" in found["j2"].kinds
+    faults = judged(command, response(command), still, response(command))
+    assert list(faults) == ["j2"]
+    assert "dead" in faults["j2"].kinds
 
 
 @pytest.mark.parametrize(
@@ -78,6 +78,6 @@ def test_a_jam_in_the_middle_is_named_with_its_time(name):
     command = COMMANDS[name]
     stopped = response(command)
     stopped[LATER] = stopped[LATER][0]
-    found = judged(command, response(command), stopped, response(command))
-    assert list(found) == ["j2"]
-    assert "jammed" in found["j2"].kinds
+    faults = judged(command, response(command), stopped, response(command))
+    assert list(faults) == ["j2"]
+    assert "jammed" in faults["j2"].kinds

@@ -47,7 +47,7 @@ def drawn(rng, rho, joints=8, blocks=40):
     return noise
 
 
-def found(values, weights):
+def shifts_of(values, weights):
     weights = limited_weights(without_single(values, weights))
     rho = correlation_of(values, weights)
     tests = 4 * len(values)
@@ -66,7 +66,7 @@ def test_chance_alone_hardly_ever_makes_a_change(rho):
     wrong = 0
     for _ in range(150):
         values = drawn(rng, rho)
-        wrong += any(any(pair) for pair in found(values, np.ones_like(values)))
+        wrong += any(any(pair) for pair in shifts_of(values, np.ones_like(values)))
     assert wrong <= 8  # 1 % of a quarter of the quantities; 99 % limit of 150 sessions at 2 %
 
 
@@ -78,7 +78,7 @@ def test_chance_alone_makes_no_change_of_joints_of_which_each_has_a_noise_of_its
     for _ in range(150):
         values = drawn(rng, 0.3, joints=6, blocks=14)
         values *= np.exp(scatter * rng.normal(size=(6, 1)))
-        wrong += any(shift for shift, _ in found(values, np.ones_like(values)))
+        wrong += any(shift for shift, _ in shifts_of(values, np.ones_like(values)))
     assert wrong <= 5  # 0.5 % of a quarter of the quantities; 99 % limit of 150 sessions at 1 %
 
 
@@ -87,16 +87,16 @@ def test_chance_alone_makes_no_change_of_joints_of_which_each_has_a_noise_of_its
 def test_the_noise_of_a_series_is_the_same_with_a_step(rho, step):
     """Of what is new from block to block: (1 - rho^2) times the weighted variance."""
     rng = np.random.default_rng(2)
-    found = []
+    noises = []
     for _ in range(300):
         weights = rng.uniform(0.5, 2, 40)
         values = drawn(rng, rho, joints=1)[0] / np.sqrt(weights) + step * (np.arange(40) > 17)
         # Blocks without weight are none.
-        found.append(noise_of(np.append(values, 100.0), np.append(weights, 0.0), rho))
-    variance = np.array([noise.variance for noise in found])
+        noises.append(noise_of(np.append(values, 100.0), np.append(weights, 0.0), rho))
+    variance = np.array([noise.variance for noise in noises])
     assert np.mean(variance) == pytest.approx(1 - rho**2, rel=0.05 if step == 0 else 0.2)
     freedom = 2 / np.var(variance / np.mean(variance))
-    assert found[0].freedom == pytest.approx(freedom, rel=0.25)
+    assert noises[0].freedom == pytest.approx(freedom, rel=0.25)
 
 
 @pytest.mark.parametrize("freedom", [4, 12])
@@ -132,7 +132,7 @@ def test_a_step_among_like_joints_is_found_in_few_blocks():
     values = drawn(np.random.default_rng(8), 0.0, joints=30, blocks=14)
     values[2, 8:] += 5.0
     weights = np.ones_like(values)
-    assert [k for k, (shift, _) in enumerate(found(values, weights)) if shift] == [2]
+    assert [k for k, (shift, _) in enumerate(shifts_of(values, weights)) if shift] == [2]
     alone = largest_shift(values[2], weights[2], 0.0, 4 * 30, 3, compared=True)
     assert alone is None
 
@@ -140,7 +140,7 @@ def test_a_step_among_like_joints_is_found_in_few_blocks():
 def test_a_step_of_many_deviations_is_found_where_it_is():
     values = drawn(np.random.default_rng(3), 0.3)
     values[2, 25:] += 8
-    shifts = [shift for shift, _ in found(values, np.ones_like(values))]
+    shifts = [shift for shift, _ in shifts_of(values, np.ones_like(values))]
     assert [k for k, shift in enumerate(shifts) if shift] == [2]
     assert abs(shifts[2].first - 25) <= 1
     assert shifts[2].change == pytest.approx(8, abs=1)
@@ -149,14 +149,14 @@ def test_a_step_of_many_deviations_is_found_where_it_is():
 def test_a_drift_is_found_with_its_size():
     values = drawn(np.random.default_rng(4), 0.0)
     values[5] += np.linspace(0, 12, values.shape[1])
-    drifts = [drift for _, drift in found(values, np.ones_like(values))]
+    drifts = [drift for _, drift in shifts_of(values, np.ones_like(values))]
     assert drifts[5].change == pytest.approx(12, abs=2)
 
 
 def test_one_block_alone_is_no_change_however_large():
     values = drawn(np.random.default_rng(5), 0.0)
     values[1, 20] = 1000
-    assert not any(any(pair) for pair in found(values, np.ones_like(values)))
+    assert not any(any(pair) for pair in shifts_of(values, np.ones_like(values)))
 
 
 def test_blocks_in_which_a_response_settles_count_as_time():

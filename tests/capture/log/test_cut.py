@@ -25,9 +25,9 @@ def test_a_cut_holds_exactly_the_messages_of_its_window(tmp_path, make):
     whole = write_log(tmp_path / "whole.mcap", ticks(), **MAKES[make])
     same = write_log(tmp_path / "same.mcap", ticks())  # mcap reads it whatever the make
     report = cut_log(whole, tmp_path / "cut.mcap", start_s=0.5, stop_s=1.21)
-    wanted = between(read(same), 500, 1210)
-    assert len(wanted) == 71
-    assert read(tmp_path / "cut.mcap") == wanted
+    expected = between(read(same), 500, 1210)
+    assert len(expected) == 71
+    assert read(tmp_path / "cut.mcap") == expected
     assert sum(report.messages.values()) == 71
     assert report.start_ns == EPOCH_NS + 500 * MS
 
@@ -84,8 +84,8 @@ def test_a_session_that_was_cut_reads_as_one(tmp_path):
         assert session.warnings == []
         assert (session.session_id, session.verdict) == ("s1", "good")
         assert session.robot.name == "snake13"
-        found = session.joints("/joint_states").values[0]
-        assert found == pytest.approx(0.001 * np.arange(100, 200), abs=1e-15)
+        angles = session.joints("/joint_states").values[0]
+        assert angles == pytest.approx(0.001 * np.arange(100, 200), abs=1e-15)
     with AnyReader([tmp_path / "cut.mcap"]) as reader:
         assert reader.message_count == 100
         connection, t_ns, raw = next(iter(reader.messages()))
@@ -125,8 +125,8 @@ def test_latched_topics_of_ros_are_known(tmp_path):
         writer.add_message(ids[2], EPOCH_NS + 100 * MS, b"z", 0, 9)
     cut_log(path, tmp_path / "cut.mcap", start_s=0.05, carry_state=True)
     # /map: the last one; /tf_static: each different one; /scan is volatile.
-    found = [(m[1], m[3]) for m in read(tmp_path / "cut.mcap", log_time_order=False)]
-    assert found == [("/tf_static", 4), ("/map", 6), ("/tf_static", 7), ("/scan", 9)]
+    kept = [(m[1], m[3]) for m in read(tmp_path / "cut.mcap", log_time_order=False)]
+    assert kept == [("/tf_static", 4), ("/map", 6), ("/tf_static", 7), ("/scan", 9)]
 
 
 def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path, command):
@@ -135,9 +135,9 @@ def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path, command):
     (tmp_path / "torn.mcap").write_bytes(data[: len(data) // 2])
     cut = ("log", "cut", tmp_path / "torn.mcap", "--start", "0.2", "-o", tmp_path / "cut.mcap")
     assert "warning: the file is cut short (no footer)" in command(*cut).out
-    found = read(tmp_path / "cut.mcap")
-    assert 10 < len(found) < 150
-    assert found == between(read(whole), 200, 1e6)[: len(found)]
+    messages = read(tmp_path / "cut.mcap")
+    assert 10 < len(messages) < 150
+    assert messages == between(read(whole), 200, 1e6)[: len(messages)]
     stored, attached = records(tmp_path / "cut.mcap")
     assert "cut short" in stored["undulog.edit"]["warnings"]
     assert [a[:2] for a in attached] == [("a.txt", b"a")]

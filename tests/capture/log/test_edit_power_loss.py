@@ -31,6 +31,6 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
     disk.run(recovered, disk.root)
     for loss in Loss:
-        found, warnings = read(disk.after(loss) / "whole.mcap")
-        assert found == recorder.truth(500)
+        messages, warnings = read(disk.after(loss) / "whole.mcap")
+        assert messages == recorder.truth(500)
         assert warnings == []

@@ -52,12 +52,12 @@ def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path):
     two = write_log(tmp_path / "two.mcap", texts, use_chunking=False)
     three = write_log(tmp_path / "three.mcap", [("/c", 2 * MS, "three")], **MAKES["lz4"])
     merge_logs([log, two, three], tmp_path / "all.mcap")
-    found = read(tmp_path / "all.mcap", log_time_order=False)
-    assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in found] == [
+    messages = read(tmp_path / "all.mcap", log_time_order=False)
+    assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in messages] == [
         *[("/a", 0), ("/b", 1), ("/a", 2), ("/a", 2), ("/b", 2), ("/c", 2)],
         *[("/a", 4), ("/b", 4), ("/b", 5), ("/a", 9)],
     ]
-    assert sorted(found) == sorted(m for path in (log, two, three) for m in read(path))
+    assert sorted(messages) == sorted(m for path in (log, two, three) for m in read(path))
 
 
 def test_a_topic_of_several_logs_becomes_one_channel(tmp_path):

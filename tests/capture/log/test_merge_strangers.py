@@ -42,33 +42,33 @@ def test_logs_two_months_apart_are_merged_on_request(tmp_path, command):
 
 
 def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path):
-    one = bag(tmp_path / "one.mcap", ["a"])
+    base = bag(tmp_path / "one.mcap", ["a"])
     hour = bag(tmp_path / "hour.mcap", ["a"], EPOCH_NS + 2 * 3600 * NS)
     near = bag(tmp_path / "near.mcap", ["a"], EPOCH_NS + 2 * NS)
-    (warning,) = merge_logs([one, hour], tmp_path / "far.mcap").warnings
+    (warning,) = merge_logs([base, hour], tmp_path / "far.mcap").warnings
     assert "hour.mcap begins 2.0 h after" in warning
-    assert merge_logs([one, near], tmp_path / "both.mcap").warnings == []
+    assert merge_logs([base, near], tmp_path / "both.mcap").warnings == []
     late = bag(tmp_path / "late.mcap", ["a"], EPOCH_NS + 3 * DAY)
     log = HostileLog()  # that bridges the time between the two
     log.channel("/temperature", log.schema())
     log.chunk([(1, EPOCH_NS + k * DAY, joint_state(EPOCH_NS, ["a"], [20.0])) for k in range(5)])
-    report = merge_logs([one, late, log.write(tmp_path / "long.mcap")], tmp_path / "out.mcap")
+    report = merge_logs([base, late, log.write(tmp_path / "long.mcap")], tmp_path / "out.mcap")
     assert not any("begins" in text for text in report.warnings)
 
 
 def test_logs_without_a_joint_in_common_are_warned_of(tmp_path):
-    one = bag(tmp_path / "one.mcap", ["a", "b"])
+    base = bag(tmp_path / "one.mcap", ["a", "b"])
     other = bag(tmp_path / "other.mcap", ["x", "y"])
-    warnings = merge_logs([one, other], tmp_path / "out.mcap").warnings
+    warnings = merge_logs([base, other], tmp_path / "out.mcap").warnings
     assert any("has a, b" in text and "are they of one robot?" in text for text in warnings)
     same = bag(tmp_path / "same.mcap", ["b", "c"])
-    warnings = merge_logs([one, same], tmp_path / "both.mcap").warnings
+    warnings = merge_logs([base, same], tmp_path / "both.mcap").warnings
     assert not any("one robot" in text for text in warnings)
 
 
 def test_logs_of_two_robots_are_refused_and_on_request_warned_of(tmp_path):
-    one, other = (session(tmp_path / f"{name}.mcap", name) for name in ("snake25", "snake13"))
+    first, other = (session(tmp_path / f"{name}.mcap", name) for name in ("snake25", "snake13"))
     with pytest.raises(UsageError, match=r"different robots.*--robot NAME"):
-        merge_logs([one, other], tmp_path / "out.mcap")
-    warnings = merge_logs([one, other], tmp_path / "out.mcap", robot="snake25").warnings
+        merge_logs([first, other], tmp_path / "out.mcap")
+    warnings = merge_logs([first, other], tmp_path / "out.mcap", robot="snake25").warnings
     assert any("is of snake13, not of snake25" in text for text in warnings)

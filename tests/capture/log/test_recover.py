@@ -61,10 +61,10 @@ def unfinished(path, count, **options):
 def check_killed(path, accepted):
     """Everything that was accepted is read, once, and nothing on the disk is changed by it."""
     before = fingerprint(path.parent)
-    found, warnings = read(path)
+    messages, warnings = read(path)
     # The child may have been killed between accepting and reporting.
-    assert len(found) in (accepted, accepted + 1)
-    assert found == recorder.truth(len(found))
+    assert len(messages) in (accepted, accepted + 1)
+    assert messages == recorder.truth(len(messages))
     assert fingerprint(path.parent) == before
     return warnings
 
@@ -109,8 +109,8 @@ def test_kills_lose_no_accepted_message(kills, tmp_path):
             assert any("none is missing" in text for text in warnings)
             output = path.with_name("whole.mcap")
             assert recover_log(path, output).missing == 0
-            found, warnings = read(output)
-            assert found == recorder.truth(len(found))
+            messages, warnings = read(output)
+            assert messages == recorder.truth(len(messages))
             assert warnings == []
             shutil.rmtree(path.parent)
 
@@ -142,8 +142,8 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
             _kill_at(child, path, rng.randrange(WHOLE) if run else sys.maxsize)
             child.stdout.read()
         before = fingerprint(path.parent)
-        found, warnings = read(path)
-        assert found == recorder.truth(6000)
+        messages, warnings = read(path)
+        assert messages == recorder.truth(6000)
         assert fingerprint(path.parent) == before
         if warnings:
             assert any(text in warnings[0] for text in ("none is missing", "is unknown", "whole"))
@@ -157,8 +157,8 @@ def test_a_recording_that_runs_can_be_read(tmp_path, path):
     for count in range(1, 3001):
         recorder.write(sink, count - 1)
         if count % 500 == 0:
-            found, warnings = read(path)
-            assert found == recorder.truth(count)
+            messages, warnings = read(path)
+            assert messages == recorder.truth(count)
             assert len(warnings) == 1
             assert f"this recording is running: its first {count} messages are read" in warnings[0]
     assert check_session(path).file.running
@@ -181,9 +181,9 @@ def test_a_recording_can_be_read_at_any_moment(tmp_path, recordings):
                 os.read(child.stdout.fileno(), 8)
                 counts = []
                 for _ in range(5):
-                    found, _ = read(path)
-                    assert found == truth[: len(found)]
-                    counts.append(len(found))
+                    messages, _ = read(path)
+                    assert messages == truth[: len(messages)]
+                    counts.append(len(messages))
                     os.read(child.stdout.fileno(), 1 << 16)  # let it go on
             finally:
                 child.kill()
@@ -210,8 +210,8 @@ def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp
             shutil.copy(left, copy / folder.name)
     shutil.copy(tmp_path / "run.mcap.part", copy)
     sink.close(())
-    found, warnings = read(copy / "run.mcap")
-    assert found == recorder.truth(8000)
+    messages, warnings = read(copy / "run.mcap")
+    assert messages == recorder.truth(8000)
     assert "none is missing" in warnings[0]
 
 
@@ -225,8 +225,8 @@ def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, path, lef
     os.truncate(part, 8 if left == "magic" else 0)
     if left == "missing":
         part.unlink()
-    found, warnings = read(path)
-    assert found == recorder.truth(100)
+    messages, warnings = read(path)
+    assert messages == recorder.truth(100)
     assert any("100 of them from its write-ahead log; none is missing" in w for w in warnings)
     with Session(path) as session:
         assert session.metadata["undulog"]["session_id"] == "killed"
@@ -244,8 +244,8 @@ def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
     rng = random.Random(3)
     for size in [0, 7, 8, 50, *(rng.randrange(len(whole)) for _ in range(30)), len(whole)]:
         part.write_bytes(whole[:size])
-        found, warnings = read(path)
-        assert sorted(found, key=lambda m: m[2]) == recorder.truth(4000), size
+        messages, warnings = read(path)
+        assert sorted(messages, key=lambda m: m[2]) == recorder.truth(4000), size
         assert any("none is missing" in text for text in warnings)
 
 
@@ -259,8 +259,8 @@ def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(pa
         at = rng.randrange(2000, len(raw) - 5000)
         raw[at : at + 4096] = bytes(4096)  # a page that never reached the disk
         part.write_bytes(raw)
-        found, _ = read(path)
-        assert sorted(found, key=lambda m: m[2]) == recorder.truth(8000)
+        messages, _ = read(path)
+        assert sorted(messages, key=lambda m: m[2]) == recorder.truth(8000)
 
 
 def test_what_is_in_neither_is_counted(tmp_path, path):
@@ -269,11 +269,11 @@ def test_what_is_in_neither_is_counted(tmp_path, path):
     assert len(segments) > 3
     segments[1].unlink()
     os.truncate(unfinished_path(path), 0)  # or it may have them by now: that is the disk's affair
-    found, warnings = read(path)
-    lost = 6000 - len(found)
+    messages, warnings = read(path)
+    lost = 6000 - len(messages)
     assert lost > 0
-    kept = {m[2] for m in found}
-    assert found == [m for m in recorder.truth(6000) if m[2] in kept]
+    kept = {m[2] for m in messages}
+    assert messages == [m for m in recorder.truth(6000) if m[2] in kept]
     assert any(f"{lost} of 6000 are missing" in text for text in warnings)
     health = check_session(path)
     assert health.verdict == "bad"
@@ -288,9 +288,9 @@ def test_a_complete_session_is_degraded_at_most_and_a_cut_file_without_its_log(t
     assert any(text.startswith(start) for text in health.reasons)
     assert not any("cut short" in text for text in (*health.reasons, *health.notes))
     shutil.rmtree(tmp_path / "run.mcap.wal")
-    found, warnings = read(path)
-    assert found == recorder.truth(len(found))
-    assert 0 < len(found) < 6000
+    messages, warnings = read(path)
+    assert messages == recorder.truth(len(messages))
+    assert 0 < len(messages) < 6000
     assert any("no footer" in text for text in warnings)
 
 
@@ -355,11 +355,11 @@ def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_pat
     path.write_bytes(raw[:-2000])
     report = recover_log(path, tmp_path / "out.mcap")
     assert (report.missing, bool(report.warnings)) == (None, True)
-    found, warnings = read(tmp_path / "out.mcap")
+    messages, warnings = read(tmp_path / "out.mcap")
     assert warnings == []
-    times = {m[2] for m in found}
-    assert found == [m for m in recorder.truth(6000) if m[2] in times]
-    assert 1000 < len(found) < 6000
+    times = {m[2] for m in messages}
+    assert messages == [m for m in recorder.truth(6000) if m[2] in times]
+    assert 1000 < len(messages) < 6000
 
 
 def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, path, command):
@@ -372,8 +372,8 @@ def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, path,
             channel.write(recorder.EPOCH_NS + k * 10_000_000, f"mode {k}")
     truth, _ = read(other)
     shutil.copy(other, path)
-    found, warnings = read(path)
-    assert found == truth
+    messages, warnings = read(path)
+    assert messages == truth
     assert len(warnings) == 1
     assert warnings[0].startswith("run.mcap.wal is the write-ahead log of another session (killed)")
     health = check_session(path)
@@ -455,12 +455,12 @@ def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(path):
         for length in (0, 1 << 40, index.chunk_length // 3):
             whole[at + 1 : at + 9] = length.to_bytes(8, "little")
             path.write_bytes(whole)
-            found, warnings = read(path)
+            messages, warnings = read(path)
             first = (index.message_start_time - recorder.EPOCH_NS) // 10**6
             last = (index.message_end_time - recorder.EPOCH_NS) // 10**6
-            rest = [m for m in found if not first <= (m[2] - recorder.EPOCH_NS) // 10**6 <= last]
+            rest = [m for m in messages if not first <= (m[2] - recorder.EPOCH_NS) // 10**6 <= last]
             assert rest == truth[:first] + truth[last + 1 :], (broken, length)
-            assert set(found) <= set(truth)
+            assert set(messages) <= set(truth)
             assert any("is damaged and was skipped" in text for text in warnings)
 
 
@@ -498,18 +498,18 @@ def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported
         shutil.copytree(source, place)
         damage(rng, place)
         try:
-            found, warnings = read(place / "run.mcap")
+            messages, warnings = read(place / "run.mcap")
             check_session(place)
             report = recover_log(place, tmp_path / "out.mcap", force=True)
         except errors.UndulogError:
             outcomes["none"] += 1
             continue
-        assert set(found) <= truth, run
-        assert len(set(found)) == len(found), run
-        assert sum(report.messages.values()) == len(found), run
+        assert set(messages) <= truth, run
+        assert len(set(messages)) == len(messages), run
+        assert sum(report.messages.values()) == len(messages), run
         # What the damaged log itself can't tell any more is not counted.
-        assert report.missing is None or report.missing <= total - len(found), run
-        assert len(found) == total or warnings, run
-        outcomes["all" if len(found) == total else "some"] += 1
+        assert report.missing is None or report.missing <= total - len(messages), run
+        assert len(messages) == total or warnings, run
+        outcomes["all" if len(messages) == total else "some"] += 1
     assert outcomes["none"] <= runs // 20
     assert outcomes.keys() >= {"all", "some"}

@@ -157,10 +157,10 @@ def test_a_failed_slice_is_tried_again_in_eighths_until_single_frames(stage_of, 
 
     def tried(first, number):
         sizes, here = [number], first <= bad < first + number
-        each = (number + 7) // 8
+        piece = (number + 7) // 8
         if here and number > 1:
-            for start in range(first, first + number, each):
-                sizes += tried(start, min(each, first + number - start))
+            for start in range(first, first + number, piece):
+                sizes += tried(start, min(piece, first + number - start))
         return sizes
 
     stage.give(count)

@@ -41,16 +41,16 @@ class Model:
         """Device times; an impossible one is that of the last possible sample within 100 ms."""
         good = [0 <= t < END_NS for t in device]
         self.odd += good.count(False)
-        found = (self.device, self.came) if self.own_clock else None
-        if found is None and True in good:
-            found = (device[good.index(True)], host[good.index(True)])
+        nearest = (self.device, self.came) if self.own_clock else None
+        if nearest is None and True in good:
+            nearest = (device[good.index(True)], host[good.index(True)])
         times = []
         for t, came, is_good in zip(device, host, good, strict=True):
             if is_good:
-                found = (t, came)
-            near = found is not None and came - found[1] <= 100 * MS
-            times.append(t if is_good else found[0] if near else came)
-        self.came = found[1] if found else self.came
+                nearest = (t, came)
+            near = nearest is not None and came - nearest[1] <= 100 * MS
+            times.append(t if is_good else nearest[0] if near else came)
+        self.came = nearest[1] if nearest else self.came
         return times
 
     def in_order(self, came):
@@ -98,7 +98,7 @@ class Model:
             if early[0] == 0:
                 return self.jump(run, "jumped ahead")
             heights = heights[: early[0]]
-        _, x, y = min(heights, key=lambda one: one[0])
+        _, x, y = min(heights, key=lambda height: height[0])
         self.envelope.take(x, y)
         return len(heights)
 
@@ -107,8 +107,8 @@ class Model:
         size_s = abs(t - self.device - (came - self.host)) / NS
         self.events.append(f"the device's clock {what} by {size_s:.3f} s and is measured anew")
         self.resets += 1
-        known = (line.rate, 2e-5) if self.envelope.settled else (0.0, 1e-4)
-        self.restart(t, came, Envelope(*known))
+        prior = (line.rate, 2e-5) if self.envelope.settled else (0.0, 1e-4)
+        self.restart(t, came, Envelope(*prior))
         return self.take(run)
 
     def after_silence(self, t, came):
@@ -169,19 +169,19 @@ def test_each_sample_is_mapped_as_by_the_model(seed):
     rng = np.random.default_rng(seed)
     clock, model = SourceClock(), Model()
     for device, host in batches(rng):
-        wanted = model.add(device.tolist(), host.tolist())
-        assert clock.add(device, host).tolist() == wanted
+        expected = model.add(device.tolist(), host.tolist())
+        assert clock.add(device, host).tolist() == expected
         assert clock.pair() == model.pair
-        found = clock.result()
+        estimate = clock.result()
         line, delays = model.envelope.line, np.array(model.delays) / NS
-        counts = (found.own_clock, found.samples, found.resets, found.out_of_range)
+        counts = (estimate.own_clock, estimate.samples, estimate.resets, estimate.out_of_range)
         assert counts == (model.own_clock, len(delays), model.resets, model.odd)
-        known = model.own_clock and model.envelope.settled
-        assert found.drift_uncertainty_ppm == (line.uncertainty * 1e6 if known else None)
-        if known:
-            assert found.drift_ppm == pytest.approx((1 / (1 + line.rate) - 1) * 1e6, abs=1e-9)
+        settled = model.own_clock and model.envelope.settled
+        assert estimate.drift_uncertainty_ppm == (line.uncertainty * 1e6 if settled else None)
+        if settled:
+            assert estimate.drift_ppm == pytest.approx((1 / (1 + line.rate) - 1) * 1e6, abs=1e-9)
         if model.own_clock:
             x = model.device - model.zero
-            assert found.offset_ns == model.offset + round(line.offset_ns + line.rate * x)
-        assert found.jitter_s == pytest.approx(delays.std(), rel=1e-5, abs=1e-6)
+            assert estimate.offset_ns == model.offset + round(line.offset_ns + line.rate * x)
+        assert estimate.jitter_s == pytest.approx(delays.std(), rel=1e-5, abs=1e-6)
     assert clock.take_events() == model.events

@@ -109,7 +109,7 @@ def test_a_mistake_of_ours_is_reported_and_ends_nothing(server, client):
 @given(st.binary(max_size=400))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_whatever_comes_each_line_gets_one_line(server, data):
-    wanted = sum(bool(line.strip()) for line in data.split(b"\n"))
+    expected = sum(bool(line.strip()) for line in data.split(b"\n"))
     with clients.connected(server) as client:
         clients.polls(server, lambda: len(server._clients) == 1)
         client.sendall(data)
@@ -118,7 +118,7 @@ def test_whatever_comes_each_line_gets_one_line(server, data):
         clients.polls(server, lambda: len(server._clients) == 0)
         while piece := client.recv(65536):
             got += piece
-    assert got.count(b"\n") == wanted
+    assert got.count(b"\n") == expected
     assert all("ok" in reply for reply in (clients.replies(got) if got else []))
 
 

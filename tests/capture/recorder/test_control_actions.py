@@ -76,13 +76,13 @@ def test_a_controller_s_gait_is_in_the_session_as_it_was_sent(stage, ask):
         t_ns = stage.now_ns - 3_000_001 if k % 2 else stage.now_ns
         assert ask("gait", values=values, **({"t_ns": t_ns} if k % 2 else {})) == {}
         sent.append((stage.now_ns, t_ns, values))
-    found = stage.read("/gait")
-    assert len(found) == 1000
-    for (log_ns, t_ns, values), (found_ns, state) in zip(sent, found, strict=True):
+    messages = stage.read("/gait")
+    assert len(messages) == 1000
+    for (log_ns, t_ns, values), (read_ns, state) in zip(sent, messages, strict=True):
         assert dict(zip(state.name, state.position, strict=True)) == values
         assert state.header.stamp.sec * 10**9 + state.header.stamp.nanosec == t_ns
-        assert found_ns == log_ns
-    assert list(found[0][1].name) == ["horizontal.A", "horizontal.phase"]
+        assert read_ns == log_ns
+    assert list(messages[0][1].name) == ["horizontal.A", "horizontal.phase"]
 
 
 def test_values_of_joints_and_of_a_controller_come_behind_those_of_the_planes(stage, ask):

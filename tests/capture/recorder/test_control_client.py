@@ -46,7 +46,7 @@ def test_requests_are_lines_of_json_and_replies_come_in_their_order(line):
     other.sendall(b"".join(json.dumps(reply).encode() + b"\n" for reply in replies))
     assert client.ask_all(requests) == [{"number": k, "text": "ü"} for k in range(3)]
     lines = other.recv(4096).split(b"\n")
-    assert [json.loads(one) for one in lines[:-1]] == requests
+    assert [json.loads(text) for text in lines[:-1]] == requests
     assert lines[-1] == b""
     with pytest.raises(ValueError, match="not JSON compliant"):
         client.ask({"do": "gait", "values": {"a.b": float("nan")}})

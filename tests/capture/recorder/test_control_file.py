@@ -123,8 +123,8 @@ def test_whoever_sees_the_file_can_connect(tmp_path):
     thread.start()
     made = [(path, *control_client.listen(path, backlog=8)) for path in paths]
     thread.join()
-    for one in made:
-        control_client.release(*one)
+    for claim in made:
+        control_client.release(*claim)
     assert results == [0] * len(paths)
 
 
@@ -179,8 +179,8 @@ def test_the_usual_place_and_finding_what_runs(tmp_path):
     (path.parent / "service").mkdir()
     server = ControlServer(path, echo)
     two = ControlServer(path.parent / "service" / "a.sock", echo)
-    found = [p for p in control_client.find_sockets(environ) if tmp_path in p.parents]
-    assert found == sorted([path, path.parent / "service" / "a.sock"])
+    paths = [p for p in control_client.find_sockets(environ) if tmp_path in p.parents]
+    assert paths == sorted([path, path.parent / "service" / "a.sock"])
     server.close()
     two.close()
     assert [p for p in control_client.find_sockets(environ) if tmp_path in p.parents] == []

@@ -136,11 +136,11 @@ def test_replies_that_the_kernel_does_not_take_at_once_are_sent_as_the_client_re
         for _ in range(50):
             server.poll()  # the client reads nothing meanwhile
         assert 3 < server.requests < 20
-        (one,) = server._clients.values()
-        assert BUFFER <= len(one.outgoing) <= BUFFER + 60_100
+        (connection,) = server._clients.values()
+        assert BUFFER <= len(connection.outgoing) <= BUFFER + 60_100
         assert events_of(server) == selectors.EVENT_WRITE
-        found = clients.replies(read_all(server, client))
-        assert [len(reply["text"]) for reply in found] == [60_000] * 20
+        replies = clients.replies(read_all(server, client))
+        assert [len(reply["text"]) for reply in replies] == [60_000] * 20
         assert (server.requests, events_of(server)) == (20, selectors.EVENT_READ)
         assert server._selector.select(0) == []
 

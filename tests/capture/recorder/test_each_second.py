@@ -24,8 +24,8 @@ def test_once_a_second_and_one_at_a_time(steps):
         assert sum(map(len, done)) - before <= 1
         times.append(now_ns)
     seconds = (now_ns - begun_ns) / NS
-    for each in done:
-        assert abs(len(each) - seconds) <= 2
+    for calls in done:
+        assert abs(len(calls) - seconds) <= 2
     if done[2]:
         assert done[0][0] <= done[1][0] <= done[2][0]
 

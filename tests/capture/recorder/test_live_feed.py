@@ -35,10 +35,10 @@ DEFINITIONS = [SCHEMA, EVENTS, STATES, ROSOUT, RAW, FACTS, ROBOT]
 def test_groups_are_as_large_as_a_datagram_may_be(lengths, size):
     definitions = live_wire.LiveDefinitions(0)
     packed = [bytes(length) for length in lengths]
-    for number, one in enumerate(packed):
-        definitions.keep(Schema(number, "", "", b""), one)
+    for number, record in enumerate(packed):
+        definitions.keep(Schema(number, "", "", b""), record)
     groups = definitions.groups(size)
-    assert [one for group in groups for one in group] == packed
+    assert [record for group in groups for record in group] == packed
     sizes = [sum(map(len, group)) for group in groups]
     assert all(total <= size or len(group) == 1 for total, group in zip(sizes, groups, strict=True))
     for total, following in zip(sizes, groups[1:], strict=False):
@@ -339,12 +339,12 @@ def test_a_relay_that_is_replaced_is_found_and_gets_everything(watched, listen, 
     second = listen()  # the first is still there, bound to nothing any more
     seen = []
 
-    def known():
+    def has_everything():
         offer(feed, feed.counts.sent)
         seen.extend(received(second)[1])
         return ROBOT in seen and bool(messages(seen))
 
-    pump_until(feed, known)
+    pump_until(feed, has_everything)
     first.close()
 
 

@@ -134,9 +134,9 @@ def record(path, wrong):
                 diagnostics.write(log_ns, [DiagnosticStatus(OK, "source can0", "", "", counts)])
             if rng.random() < wrong.updates:
                 health.step(log_ns)
-        found = health.final()
-        writer.set_verdict(found.verdict, found.reasons)
-    return found
+        outcome = health.final()
+        writer.set_verdict(outcome.verdict, outcome.reasons)
+    return outcome
 
 
 def without_rounding(health):
@@ -195,8 +195,8 @@ def test_a_later_part_answers_for_its_own_losses_only(tmp_path):
         diagnostics = writer.diagnostics()
         for second, dropped in ((100, 50), (101, 50), (102, 53)):
             counts = {"frames": str(1000 * second), "dropped": str(dropped)}
-            found = {"recorder": {"elapsed_s": str(second)}, "source can0": counts}
-            statuses = [DiagnosticStatus(OK, name, "", "", found[name]) for name in found]
+            values = {"recorder": {"elapsed_s": str(second)}, "source can0": counts}
+            statuses = [DiagnosticStatus(OK, name, "", "", values[name]) for name in values]
             diagnostics.write(EPOCH_NS + second * NS, statuses)
     (source,) = check_session(path).sources
     assert (source.frames, source.dropped) == (2000, 3)
@@ -291,7 +291,7 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(seconds, dat
     measured, command = RangeTally(horizon_s=5), RangeTally(horizon_s=5)
     freeze = FreezeTally(("b", "a"), ("a", "x"))
     within = np.arange(6) * 150_000_000
-    found = None
+    frozen = None
     for second, (stands, moves) in enumerate(seconds):
         t_ns = EPOCH_NS + second * NS + within
         angles = np.column_stack([np.linspace(0, 1, 6), np.linspace(0, not stands, 6)])
@@ -300,15 +300,15 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(seconds, dat
             tally.add(t_ns, values)
         if data.draw(st.booleans()):
             closed = min(measured.closed, command.closed)
-            found = freeze.result(measured.result(2), command.result(2), closed)
+            frozen = freeze.result(measured.result(2), command.result(2), closed)
             for tally in (measured, command):
                 tally.forget(closed)
                 assert len(tally.result(2).second) <= 6
-    found = freeze.result(measured.result(2), command.result(2), None)
+    frozen = freeze.result(measured.result(2), command.result(2), None)
     lasted, since = longest([stands and moves for stands, moves in seconds])
     assert freeze.columns == (1,)
-    assert found[0].tolist() == [lasted]
-    assert found[1].tolist() == [EPOCH_NS // NS + since if lasted else 0]
+    assert frozen[0].tolist() == [lasted]
+    assert frozen[1].tolist() == [EPOCH_NS // NS + since if lasted else 0]
 
 
 @pytest.mark.nightly
@@ -319,12 +319,12 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
         gc.collect()
         seen, stack, total = set(), [health], 0
         while stack:
-            each = stack.pop()
-            if id(each) in seen or isinstance(each, type):
+            part = stack.pop()
+            if id(part) in seen or isinstance(part, type):
                 continue
-            seen.add(id(each))
-            total += sys.getsizeof(each)
-            stack += [other for other in gc.get_referents(each) if not callable(other)]
+            seen.add(id(part))
+            total += sys.getsizeof(part)
+            stack += [other for other in gc.get_referents(part) if not callable(other)]
         return total
 
     health = LiveHealth(ROBOT)
@@ -332,7 +332,7 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
     with judged(tmp_path / "s.mcap", health) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
         states = writer.joint_state("/joint_states", NAMES, unit="rad")
-        bus, said, diagnostics = writer.frames("/can/can0"), writer.log(), writer.diagnostics()
+        bus, log, diagnostics = writer.frames("/can/can0"), writer.log(), writer.diagnostics()
         frames = empty_frames(1)
         for second in range(3600):
             t_ns = EPOCH_NS + second * NS
@@ -341,7 +341,7 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path):
             frames["t_host_ns"] = t_ns
             bus.write(t_ns, frames)
             if second % 5 == 0:
-                said.write(t_ns, "info", "recorder", f"second {second} of {'x' * (second % 97)}")
+                log.write(t_ns, "info", "recorder", f"second {second} of {'x' * (second % 97)}")
                 values = {"frames": str(second), "elapsed_s": str(second)}
                 diagnostics.write(t_ns, [DiagnosticStatus(OK, "source c", "", "", values)])
             if second % 10 == 9:

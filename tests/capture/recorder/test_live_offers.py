@@ -76,9 +76,17 @@ def test_a_batch_is_queued_as_its_messages_are(stage, channel, count):
     stage.connect()
     stage.feed.offer_batch(batch_of(channel, 3, first=5))
     assert stage.feed.queued == count
-    found = [(one.channel_id, one.sequence, one.log_time_ns, one.publish_time_ns, one.payload)
-             for one in stage.sent()]  # fmt: skip
-    assert found == [
+    queued = [
+        (
+            message.channel_id,
+            message.sequence,
+            message.log_time_ns,
+            message.publish_time_ns,
+            message.payload,
+        )
+        for message in stage.sent()
+    ]
+    assert queued == [
         (channel, k, k * 10 * MS, k * 10 * MS - 1, bytes([k, 0])) for k in (5, 6, 7)
     ][:count]  # fmt: skip
 
@@ -124,7 +132,7 @@ def test_samples_are_thinned_by_their_times_as_by_a_plain_rule(stage):
             kept.append(number)
             due_ns = max(due_ns + period_ns, at_ns)
     sent = stage.sent()
-    assert [one.sequence for one in sent] == kept
+    assert [message.sequence for message in sent] == kept
     assert stage.feed.counts.thinned == 2000 - len(kept)
 
 

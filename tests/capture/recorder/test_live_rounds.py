@@ -106,16 +106,16 @@ def test_messages_are_taken_in_pieces_of_128_kib_of_equal_numbers():
         payloads = [text(size) for size in sizes]
         total = sum(map(len, payloads))
         pieces = max(1, (total + PIECE - 1) // PIECE)
-        each = (len(sizes) + pieces - 1) // pieces
+        piece_size = (len(sizes) + pieces - 1) // pieces
         health, seen = texts_of(1), []
         for number, payload in enumerate(payloads):
             health.offer(1, EPOCH_NS + number, EPOCH_NS, number, payload)
         for _ in range(20):
             health.step(EPOCH_NS)
-            found = [topic.count for topic in health.topics()]
-            if found and found[0] not in seen:
-                seen += found
-        assert seen == [*range(each, len(sizes), each), len(sizes)]
+            taken = [topic.count for topic in health.topics()]
+            if taken and taken[0] not in seen:
+                seen += taken
+        assert seen == [*range(piece_size, len(sizes), piece_size), len(sizes)]
         assert health.final().channels[0].sequence.dropped in (0, None)
 
 
@@ -180,12 +180,12 @@ def test_joints_at_their_limits_frozen_ones_and_lost_values_are_named(judged):
         angles[6] = 0.1 if 320 <= tick < 480 else angles[6]  # in no two
         angles[7] = np.nan if tick < 9 else angles[7]
         states.write(t_ns, angles)
-    found = topic_of(health, "/joint_states")
+    topic = topic_of(health, "/joint_states")
     # Of joints 3 and 4 the rest stands for more than two seconds as well.
-    assert found.at_limit == (names[4],)
-    assert found.frozen == (names[3], names[4], names[5])
-    assert (found.nan, found.count, found.dropped) == (9, 500, 0)
-    assert (topic_of(health, "/joint_commands").at_limit, found.gaps, found.missing) == ((), 0, 0)
+    assert topic.at_limit == (names[4],)
+    assert topic.frozen == (names[3], names[4], names[5])
+    assert (topic.nan, topic.count, topic.dropped) == (9, 500, 0)
+    assert (topic_of(health, "/joint_commands").at_limit, topic.gaps, topic.missing) == ((), 0, 0)
 
 
 def test_the_rhythm_of_a_topic_is_that_of_all_its_series(judged):
@@ -210,9 +210,9 @@ def test_the_rhythm_of_a_topic_is_that_of_all_its_series(judged):
     for tick in range(200):  # a third one has no rhythm
         t_ns = EPOCH_NS + tick * 100 * MS + rng.randrange(95 * MS)
         whole.write(t_ns, [0.0] * 3, log_time_ns=EPOCH_NS + 2000 + tick)
-    found = topic_of(health, "/joint_current")
-    assert (found.gaps, found.missing, found.jitter) == (None, None, None)
-    assert found.count == len(even) + 399 + 200
+    topic = topic_of(health, "/joint_current")
+    assert (topic.gaps, topic.missing, topic.jitter) == (None, None, None)
+    assert topic.count == len(even) + 399 + 200
 
 
 @pytest.mark.parametrize("prefix", ["/can/", "/can_fd/", "/serial/", "/other/"])
@@ -223,10 +223,10 @@ def test_messages_of_frames_have_no_rhythm_of_their_own(judged, prefix):
     for tick in range(60):
         frames["t_host_ns"] = EPOCH_NS + tick * 20 * MS
         bus.write(EPOCH_NS + tick * 20 * MS, frames)
-    found = topic_of(health, f"{prefix}x", EPOCH_NS + 5 * NS)
-    rhythm = (found.gaps, found.missing, found.jitter)
+    topic = topic_of(health, f"{prefix}x", EPOCH_NS + 5 * NS)
+    rhythm = (topic.gaps, topic.missing, topic.jitter)
     assert rhythm == ((0, 0, 0.0) if prefix == "/other/" else (None, None, None))
-    assert found.age_s == pytest.approx(5.0 - 59 * 0.02)
+    assert topic.age_s == pytest.approx(5.0 - 59 * 0.02)
 
 
 def test_ages_are_never_negative_and_rates_need_two_times():
@@ -268,17 +268,28 @@ def source(name="x", *, frames=0, robot=None, connected=True, **counted):
 
 def test_a_source_has_its_counts_its_load_and_its_age(judged):
     health, writer = judged
-    one = source(frames=7, dropped=3, malformed=4, error_frames=5, reconnects=6)
-    found = health.source(one, "can:x", SourceClock())
-    assert (found.name, found.address, found.connected, found.finished) == (
+    state = source(frames=7, dropped=3, malformed=4, error_frames=5, reconnects=6)
+    snapshot = health.source(state, "can:x", SourceClock())
+    assert (snapshot.name, snapshot.address, snapshot.connected, snapshot.finished) == (
         "x",
         "can:x",
         True,
         False,
     )
-    counted = (found.frames, found.dropped, found.malformed, found.error_frames, found.reconnects)
+    counted = (
+        snapshot.frames,
+        snapshot.dropped,
+        snapshot.malformed,
+        snapshot.error_frames,
+        snapshot.reconnects,
+    )
     assert counted == (7, 3, 4, 5, 6)
-    assert (found.age_s, found.load, found.rate_hz, found.clock) == (None, None, None, None)
+    assert (snapshot.age_s, snapshot.load, snapshot.rate_hz, snapshot.clock) == (
+        None,
+        None,
+        None,
+        None,
+    )
     bus, later = writer.frames("/can/x"), writer.string("/mode")
     frames = empty_frames(100)
     frames["dlc"] = 8
@@ -290,10 +301,10 @@ def test_a_source_has_its_counts_its_load_and_its_age(judged):
     health.update(EPOCH_NS + 5 * NS)
     clock = SourceClock()
     clock.add(np.array([5]), np.array([EPOCH_NS]))
-    found = health.source(one, "can:x", clock)
-    assert found.age_s == 2.0
-    assert found.clock == clock.result()
-    low, high = found.load
+    snapshot = health.source(state, "can:x", clock)
+    assert snapshot.age_s == 2.0
+    assert snapshot.clock == clock.result()
+    low, high = snapshot.load
     bitrate = load_robot("snake25").bus.bitrate
     # A classic frame of 8 bytes: 44 bits, 64 of data, 3 in between; at most a quarter is stuffed.
     assert 108 * 100 / bitrate <= low < high <= 1.25 * 112 * 100 / bitrate

@@ -93,7 +93,7 @@ def test_a_datagram_is_read_whole_or_refused_wherever_it_is_cut():
     for size in range(24, len(whole) + 1):
         if size in ends:
             records = read_records(whole[:size])
-            assert [one.payload for one in records] == [b"", b"x", b"yz"][: ends.index(size)]
+            assert [record.payload for record in records] == [b"", b"x", b"yz"][: ends.index(size)]
         else:
             with pytest.raises(DataError, match="cut short"):
                 read_records(whole[:size])
@@ -146,7 +146,9 @@ def kept(*records, period_ns=5):
 
 def sent(definitions):
     """The records of all groups, read."""
-    return read_records(datagram(*(one for group in definitions.groups(1 << 20) for one in group)))
+    return read_records(
+        datagram(*(definition for group in definitions.groups(1 << 20) for definition in group))
+    )
 
 
 def test_of_files_and_facts_only_the_robot_s_and_undulog_s_are_sent():
@@ -154,7 +156,11 @@ def test_of_files_and_facts_only_the_robot_s_and_undulog_s_are_sent():
              ("robot.toml", "a.dbc", "scenario.toml", "a.dbc.txt", "my robot.toml")]  # fmt: skip
     facts = [Metadata(name, {"a": "1"}) for name in ("undulog", "undulog.clock", "")]
     definitions = kept(*files, *facts)
-    assert [one.name for one in sent(definitions)] == ["robot.toml", "a.dbc", "undulog"]
+    assert [definition.name for definition in sent(definitions)] == [
+        "robot.toml",
+        "a.dbc",
+        "undulog",
+    ]
     assert [definitions.pack(file) is None for file in (*files, *facts)] == [
         False, False, True, True, True, False, True, True,
     ]  # fmt: skip
@@ -166,7 +172,7 @@ def test_a_definition_replaces_the_one_of_its_number_or_name_in_its_place():
     files = [Attachment(0, 0, "robot.toml", "text", data) for data in (b"1", b"2")]
     facts = [Metadata("undulog", {"a": value}) for value in "12"]
     pairs = [channels, schemas, files, facts]
-    definitions = kept(*(one for one, _ in pairs), *(other for _, other in pairs))
+    definitions = kept(*(definition for definition, _ in pairs), *(other for _, other in pairs))
     assert sent(definitions) == [other for _, other in pairs]
 
 
@@ -208,11 +214,11 @@ def test_a_state_outlives_a_channel_that_is_defined_again_and_raw_frames_have_no
 def grouped(sizes, size):
     """Sizes one after the other: a new group where the next would be too much."""
     groups = []
-    for one in sizes:
-        if groups and sum(groups[-1]) + one <= size:
-            groups[-1].append(one)
+    for length in sizes:
+        if groups and sum(groups[-1]) + length <= size:
+            groups[-1].append(length)
         else:
-            groups.append([one])
+            groups.append([length])
     return groups
 
 
@@ -229,5 +235,5 @@ def test_groups_have_all_definitions_then_the_states_that_fit_into_one():
             definitions.states[number] = rng.choice([None, (number, 0, 0, 0, 0, payload)])
             if definitions.states[number] is not None and 36 + len(payload) <= size:
                 sizes.append(36 + len(payload))
-        found = [[len(one) for one in group] for group in definitions.groups(size)]
-        assert found == grouped(sizes, size)
+        lengths = [[len(record) for record in group] for group in definitions.groups(size)]
+        assert lengths == grouped(sizes, size)

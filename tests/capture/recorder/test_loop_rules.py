@@ -149,8 +149,8 @@ def test_a_bus_decodes_for_4_ms_in_its_turn_or_when_it_is_behind(stage_of, time,
     stage.each_tick = lambda: setattr(second, "behind", len(stage.done) in {4, 24, 25})
     stage.run(0.6)
     ticks = [k for k in range(31) if k % every == 1 or k in {4, 24, 25}]
-    wanted = [(k, 4 * MS, k % every == 1) for k in ticks]
-    assert first.decoded == second.decoded == [*wanted, "finish"]
+    expected = [(k, 4 * MS, k % every == 1) for k in ticks]
+    assert first.decoded == second.decoded == [*expected, "finish"]
 
 
 @pytest.mark.parametrize(
@@ -296,12 +296,12 @@ def test_jumps_of_a_device_s_clock_are_told_while_recording_and_at_the_end(stage
     source = Ending(time, frames=lambda _: 1)
     source.behind_ns = lambda polls: (9000 - 1000 * (polls > 5) - 1000 * (polls > 15)) * NS
     stage = stage_of(source)
-    told = []
-    stage.each_tick = lambda: told.append(len(stage.events))
+    counts = []
+    stage.each_tick = lambda: counts.append(len(stage.events))
     stage.run(0.3)
     text = "the device's clock jumped ahead by 1000.000 s and is measured anew"
     assert [event for event in stage.events if event[1] == "a"] == [("warn", "a", text)] * 2
-    assert told == [1] * 11 + [2] * 5
+    assert counts == [1] * 11 + [2] * 5
 
 
 @pytest.mark.parametrize(("count", "more"), [(1, ""), (8, ""), (9, " and 1 more"),

@@ -193,7 +193,7 @@ def test_losses_are_those_since_the_last_report_without_a_pause(before, after, t
 
 def test_the_time_of_suspension_is_what_the_monotonic_clock_lacks(monkeypatch):
     clock = SimpleNamespace(
-        CLOCK_BOOTTIME=7, clock_gettime_ns=lambda one: 90 * one, monotonic_ns=lambda: 600
+        CLOCK_BOOTTIME=7, clock_gettime_ns=lambda clock: 90 * clock, monotonic_ns=lambda: 600
     )
     monkeypatch.setattr(pauses, "time", clock)
     assert pauses.suspended_ns() == 30

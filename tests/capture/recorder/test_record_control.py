@@ -151,9 +151,9 @@ def test_a_controller_in_another_process_sends_its_gait_for_a_while(recorder, pl
     assert python(controller, place / "r" / "undulog" / "run.sock").returncode == 0
     ask("stop", "--wait")
     process.communicate(timeout=PATIENCE_S)
-    found = decoded(place / "run.mcap", "/gait")
-    assert len(found) == 200
-    assert found[50].position[1] == pytest.approx(1.5707963267948966, rel=1e-15)
+    messages = decoded(place / "run.mcap", "/gait")
+    assert len(messages) == 200
+    assert messages[50].position[1] == pytest.approx(1.5707963267948966, rel=1e-15)
 
 
 def test_a_ring_is_written_when_marked(recorder, place, ask):
@@ -207,9 +207,9 @@ def test_two_outputs_of_one_name_in_two_folders(recorder, place, ask):
         (place / folder).mkdir()
         started.append(recorder(f"{folder}/run", "--floor", "0"))
     recordings = json.loads(ask("status", "--json").out)["recordings"]
-    found = {recording["output"]: recording["socket"] for recording in recordings}
-    assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
-    assert f"{place}/r/undulog/run.sock" in found.values()
-    for socket in found.values():
+    sockets = {recording["output"]: recording["socket"] for recording in recordings}
+    assert set(sockets) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
+    assert f"{place}/r/undulog/run.sock" in sockets.values()
+    for socket in sockets.values():
         ask("stop", "--wait", "--socket", socket)
     assert [process.wait(PATIENCE_S) for process in started] == [0, 0]

@@ -47,8 +47,12 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     health = check_session(output)
     assert (health.stored, health.stored_reasons) == (health.verdict, health.reasons)
     assert (report["verdict"], tuple(report["reasons"])) == (health.verdict, health.reasons)
-    (found,) = health.sources
-    assert (found.name, found.frames, found.dropped) == ("bus", sent, 12)
+    (health_of_source,) = health.sources
+    assert (health_of_source.name, health_of_source.frames, health_of_source.dropped) == (
+        "bus",
+        sent,
+        12,
+    )
     assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
     clock = metadata_of(output)["undulog.clock"]
     unsure = float(clock["bus.drift_uncertainty_ppm"])

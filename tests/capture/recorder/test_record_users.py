@@ -121,8 +121,8 @@ def test_a_live_feed_sends_nothing_to_another_users_socket(shared):
         out, _ = other.communicate("look\n", timeout=60)
         assert out == "nothing\n"
     path.unlink()
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
-        own.bind(str(path))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(str(path))
         feed = LiveFeed(path)
         feed.pump()
         assert feed.connected
@@ -177,12 +177,12 @@ def test_no_link_in_the_place_of_a_session_is_followed(name, tmp_path):
 
 
 def test_the_log_of_the_folders_own_user_may_be_replaced_by_root(shared):
-    own = shared / "own"
-    own.mkdir()
-    os.chown(own, NOBODY, NOBODY)
-    (own / "run.mcap.wal").mkdir()
-    os.chown(own / "run.mcap.wal", NOBODY, NOBODY)
-    with WriteAheadLog(own / "run.mcap.wal") as log:
+    folder = shared / "own"
+    folder.mkdir()
+    os.chown(folder, NOBODY, NOBODY)
+    (folder / "run.mcap.wal").mkdir()
+    os.chown(folder / "run.mcap.wal", NOBODY, NOBODY)
+    with WriteAheadLog(folder / "run.mcap.wal") as log:
         log.release(0)
 
 
@@ -202,16 +202,16 @@ def test_of_recorders_that_are_given_one_output_at_once_one_records(force, tmp_p
         )
         for name, control in zip(names, controls, strict=True)
     ]
-    wait_for(lambda: sum(each.poll() is not None for each in recorders) >= 2, "the others")
+    wait_for(lambda: sum(recorder.poll() is not None for recorder in recorders) >= 2, "the others")
     wait_for(lambda: any(control.exists() for control in controls), "the one that records")
     for recorder in recorders:
         if recorder.poll() is None:
             recorder.send_signal(signal.SIGTERM)
-    said = sorted(each.communicate()[1] for each in recorders)
+    texts = sorted(recorder.communicate()[1] for recorder in recorders)
     refusals = "exists already", "another recorder is writing it"
-    refused = [text for text in said if any(words in text for words in refusals)]
-    (recorded,) = [text for text in said if text not in refused]
+    refused = [text for text in texts if any(words in text for words in refusals)]
+    (recorded,) = [text for text in texts if text not in refused]
     assert "was never connected: " in recorded
-    assert "Traceback" not in "".join(said)
+    assert "Traceback" not in "".join(texts)
     assert len(messages_of(output)) > 0
     assert [path.name for path in tmp_path.glob("run*")] == ["run.mcap"]

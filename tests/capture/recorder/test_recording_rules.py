@@ -88,14 +88,14 @@ def stage(tmp_path, monkeypatch):
 def test_the_state_is_on_diagnostics_each_second_and_at_the_end(stage):
     source = Source()
     stage.recording(source, duration=3.0).run()
-    found = [message for *_, message in decoded_of(stage.folder / "run.mcap", ["/diagnostics"])]
+    messages = [message for *_, message in decoded_of(stage.folder / "run.mcap", ["/diagnostics"])]
     elapsed = []
-    for message in found:
+    for message in messages:
         names = [status.name for status in message.status]
         assert names[:3] == ["recorder", "session", "source can0"]
         elapsed.append(float(message.status[0].values[0].value))
     assert [int(seconds) for seconds in elapsed] == [0, 1, 2, 3]
-    last = {value.key: value.value for value in found[-1].status[2].values}
+    last = {value.key: value.value for value in messages[-1].status[2].values}
     assert int(last["frames"]) == source.counts.frames
 
 
@@ -171,8 +171,8 @@ def test_a_good_end_has_the_verdict_of_the_health_and_the_times_of_the_ticks(sta
     report = made.run()
     times = tally.result()
     assert times.max_s == pytest.approx(0.123456789)
-    wanted = {"ticks": "1052", "tick_max_s": "0.123", "ticks_left_out": "0"}
-    assert report.recorder.items() >= (wanted | {"ended": "1 s are over"}).items()
+    expected = {"ticks": "1052", "tick_max_s": "0.123", "ticks_left_out": "0"}
+    assert report.recorder.items() >= (expected | {"ended": "1 s are over"}).items()
     for key, time_s in (("tick_p50_s", times.p50_s), ("tick_p99_s", times.p99_s)):
         assert report.recorder[key] == f"{time_s:.3g}"
     health = metadata_of(stage.folder / "run.mcap")["undulog.health"]
@@ -198,8 +198,8 @@ def test_a_full_disk_has_no_last_state(stage):
         made._storage._last_words = 1 << 20
         with contextlib.suppress(LogWriteError):
             made.run()
-        found = decoded_of(stage.folder / f"{number}.mcap", ["/diagnostics"])
-        assert len(list(found)) == (1 if short else 2)
+        messages = decoded_of(stage.folder / f"{number}.mcap", ["/diagnostics"])
+        assert len(list(messages)) == (1 if short else 2)
 
 
 @pytest.mark.parametrize("duration", [None, 0.1])

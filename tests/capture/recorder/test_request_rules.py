@@ -71,8 +71,8 @@ def test_the_time_of_a_gait_is_within_an_hour_of_the_recorder_s(stage):
         assert stage.refused("gait", values={"a.b": 1}, t_ns=far) == (
             f"t_ns: found {far}, {off_s} s off this recorder's clock; valid: Unix time in ns"
         )
-    found = [one.header.stamp.sec for one in stage.read()]
-    assert found == [EPOCH_NS // 10**9 + 3600, EPOCH_NS // 10**9 - 3600]
+    times = [message.header.stamp.sec for message in stage.read()]
+    assert times == [EPOCH_NS // 10**9 + 3600, EPOCH_NS // 10**9 - 3600]
 
 
 def test_the_planes_have_five_values_each_and_further_names_two_words_at_least(stage):
@@ -94,9 +94,9 @@ def test_the_planes_have_five_values_each_and_further_names_two_words_at_least(s
         assert stage.refused("gait", values={name: 1.0}).startswith("values: found ")
     names = ("a.b", "a-b_3.c-d.e_4", "Z.0", *reversed(GAIT_NAMES))
     stage.ask("gait", values={name: float(k) for k, name in enumerate(names)})
-    (found,) = stage.read()
-    assert list(found.name) == [*GAIT_NAMES, *names[:3]]
-    assert list(found.position) == [float(k) for k in (*reversed(range(3, 13)), 0, 1, 2)]
+    (message,) = stage.read()
+    assert list(message.name) == [*GAIT_NAMES, *names[:3]]
+    assert list(message.position) == [float(k) for k in (*reversed(range(3, 13)), 0, 1, 2)]
 
 
 def test_names_of_a_later_gait_are_those_of_the_first_in_any_order(stage):
@@ -108,7 +108,7 @@ def test_names_of_a_later_gait_are_those_of_the_first_in_any_order(stage):
             f"values: found {', '.join(values)}; valid: vertical.A, x.a, the names that this "
             "session's gait began with"
         )
-    assert [list(one.position) for one in stage.read()] == [[2.0, 1.0], [4.0, 3.0]]
+    assert [list(message.position) for message in stage.read()] == [[2.0, 1.0], [4.0, 3.0]]
 
 
 @pytest.mark.parametrize("t_ns", [True, 1.5, "1"])
@@ -140,7 +140,7 @@ def test_which_texts_a_message_can_hold(stage, text, why):
         assert stage.ask("note", text=text, level="error") == {}
         assert stage.ask("mode", text=text) == {}
         assert stage.events == [("error", "operator", text)]
-        assert [one.data for one in stage.read()] == [text]
+        assert [message.data for message in stage.read()] == [text]
     else:
         assert stage.refused("note", text=text).endswith(f"; valid: {why}")
         assert stage.refused("mode", text=text).endswith(f"; valid: {why}")
@@ -171,13 +171,13 @@ def test_who_waits_for_the_end_gets_no_reply_before_it(stage):
 
 def test_each_request_has_its_own_keys(stage):
     keys = {"text": "x", "level": "info", "wait": False, "values": {"a.b": 1}, "t_ns": EPOCH_NS}
-    own = {
+    keys_of = {
         "status": set(), "split": set(), "mark": {"text", "level"}, "note": {"text", "level"},
         "stop": {"wait"}, "gait": {"values", "t_ns"}, "mode": {"text"},
     }  # fmt: skip
-    for do, wanted in own.items():
-        for key in keys.keys() - wanted:
-            given = {one: keys[one] for one in wanted} | {key: keys[key]}
+    for do, needed in keys_of.items():
+        for key in keys.keys() - needed:
+            given = {name: keys[name] for name in needed} | {key: keys[key]}
             assert stage.refused(do, **given).startswith(f"{key}: found ")
     assert stage.ask("split") == {"part": 7}
     assert (stage.events, stage.actions.stops) == ([], 0)
@@ -186,6 +186,6 @@ def test_each_request_has_its_own_keys(stage):
 @pytest.mark.parametrize("length", [78, 79, 400])
 def test_what_was_found_is_shown_with_80_letters_at_most(stage, length):
     text = stage.refused("note", text="x", level="y" * length)
-    (found,) = re.findall("^level: found (.*); valid: ", text)
+    (shown,) = re.findall("^level: found (.*); valid: ", text)
     whole = '"' + "y" * length + '"'
-    assert found == (whole if length == 78 else whole[:77] + "...")
+    assert shown == (whole if length == 78 else whole[:77] + "...")

@@ -45,14 +45,16 @@ def test_each_line_has_the_room_that_the_screen_gives_it():
     }  # fmt: skip
     path = BARE.path
     for width in (*range(30, 50), *range(50, 90, 3)):
-        found, room = lines(width, **given), max(width - 30, 8)
+        shown_lines, room = lines(width, **given), max(width - 30, 8)
         shown = path if len(path) <= room else "…" + path[1 - room :]
-        assert found[0] == cut_to(f"recording {shown}", width - 8).ljust(width - 8) + " 0:01:40"
-        assert found[1] == cut_to(facts, width)
-        assert found[2] == cut_to(verdict, width)
-        assert found[3] == "  " + " ".join(["ab"] * ((width - 3) // 3))
-        assert found[4] == "    " + " ".join(["ab"] * ((width - 5) // 3)) + " …"
-        assert found[-1] == cut_to(f"0:01:35 error can0: {text}", width)
+        assert (
+            shown_lines[0] == cut_to(f"recording {shown}", width - 8).ljust(width - 8) + " 0:01:40"
+        )
+        assert shown_lines[1] == cut_to(facts, width)
+        assert shown_lines[2] == cut_to(verdict, width)
+        assert shown_lines[3] == "  " + " ".join(["ab"] * ((width - 3) // 3))
+        assert shown_lines[4] == "    " + " ".join(["ab"] * ((width - 5) // 3)) + " …"
+        assert shown_lines[-1] == cut_to(f"0:01:35 error can0: {text}", width)
 
 
 def test_a_path_is_shown_as_far_as_it_fits_from_its_end():
@@ -75,8 +77,8 @@ def test_a_path_is_shown_as_far_as_it_fits_from_its_end():
 
 def rows(*topics):
     """The first words of the rows of some topics."""
-    found = lines(100, topics=tuple(TopicSnapshot(name, 1, 10.0, 0.0) for name in topics))
-    return [line.split("  ")[0] for line in found[found.index("", 5) + 2 :]]
+    shown_lines = lines(100, topics=tuple(TopicSnapshot(name, 1, 10.0, 0.0) for name in topics))
+    return [line.split("  ")[0] for line in shown_lines[shown_lines.index("", 5) + 2 :]]
 
 
 def test_topics_without_a_rhythm_are_left_out_and_the_others_keep_their_order():
@@ -87,8 +89,8 @@ def test_sensors_of_one_kind_are_one_row_from_four_on_and_joints_never():
     joints = ["/joint_states", "/joint_commands", "/joint_power/a", "/joint_power/b", "/joint_a",
               "/joint_power/c", "/joint_power/d"]  # fmt: skip
     three, four = [f"/ir/{k}" for k in range(3)], [f"/touch/{k}/x" for k in range(4)]
-    found = rows(*joints, *four[:2], "/imu", *three, *four[2:])
-    assert found == [*joints, "/touch/ (4)", "/imu", *three]
+    first_words = rows(*joints, *four[:2], "/imu", *three, *four[2:])
+    assert first_words == [*joints, "/touch/ (4)", "/imu", *three]
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,9 @@ def refused(name, value):
 
 
 def test_flags_are_spelt_in_four_ways():
-    for words, wanted in ((("true", "1", "YES", "On", True), True),
+    for words, expected in ((("true", "1", "YES", "On", True), True),
                           (("false", "0", "No", "oFF", False), False)):  # fmt: skip
-        assert [PARSERS["live"](word) for word in words] == [wanted] * 5
+        assert [PARSERS["live"](word) for word in words] == [expected] * 5
     for odd in ("", "2", "truefalse", 1, 0, None, ["true"]):
         assert refused("live", odd) == "true or false"
 
@@ -122,14 +122,14 @@ def test_what_is_missing_is_said_and_what_a_ring_excludes():
 
 def test_faults_of_a_file_and_of_the_environment_have_their_place(tmp_path):
     file = tmp_path / "x.toml"
-    for text, wanted in (
+    for text, expected in (
         (b"[record]\nlive = 3", [(f"{file}: record.live", "3", "true or false")]),
         (b"record = 5", [(f"{file}: record", "5", "a table")]),
         (b"[records]\n[record]", [(f"{file}: records", "an unknown key", "one table, [record]")]),
         (b"a = '\xff'", [(f"{file}: byte 5", "not UTF-8", "TOML is UTF-8 text")]),
     ):
         file.write_bytes(text)
-        assert faults_of(NEEDED, {}, file) == wanted
+        assert faults_of(NEEDED, {}, file) == expected
     file.write_bytes(b"[record")
     ((key, _, valid),) = faults_of(NEEDED, {}, file)
     assert (key, valid) == (f"{file}: syntax", "TOML 1.0")
@@ -152,12 +152,12 @@ def test_a_wrong_value_that_another_layer_overrides_is_a_fault_all_the_same(tmp_
 
 
 def test_the_time_in_the_output_is_that_of_the_whole_second(monkeypatch):
-    for now_ns, wanted in (
+    for now_ns, expected in (
         (0, "19700101T000000Z"), (999_999_999, "19700101T000000Z"),
         (1_769_903_940_999_999_999, "20260131T235900Z"), (10**9, "19700101T000001Z"),
     ):  # fmt: skip
         settings = resolve(NEEDED | {"output": "{time}/a-{time}.mcap"}, {}, now_ns=now_ns)
-        assert settings.output == Path(f"{wanted}/a-{wanted}.mcap")
+        assert settings.output == Path(f"{expected}/a-{expected}.mcap")
     monkeypatch.setattr(module, "time", SimpleNamespace(time_ns=lambda: 86_400 * 10**9))
     now = resolve(NEEDED | {"output": "{time}.mcap"}, {}).output
     assert now == Path("19700102T000000Z.mcap")
@@ -167,8 +167,8 @@ def test_only_a_robot_that_a_file_names_is_looked_for_beside_it(tmp_path):
     (tmp_path / "mine.toml").write_text("")
     (tmp_path / "folder").mkdir()
     file = tmp_path / "x.toml"
-    for name, found in (("mine.toml", True), ("none.toml", False), ("folder", False)):
+    for name, is_file in (("mine.toml", True), ("none.toml", False), ("folder", False)):
         file.write_text(f'[record]\nrobot = "{name}"\n')
-        wanted = str(tmp_path / name) if found else name
-        assert resolve(NEEDED, {}, file).robot == wanted
+        expected = str(tmp_path / name) if is_file else name
+        assert resolve(NEEDED, {}, file).robot == expected
         assert resolve(NEEDED, {"UNDULOG_RECORD_ROBOT": name}, file).robot == name

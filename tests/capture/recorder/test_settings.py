@@ -136,7 +136,7 @@ def toml(table):
 
     def text(value):
         if isinstance(value, dict):
-            return "{ " + ", ".join(f"{key} = {text(one)}" for key, one in value.items()) + " }"
+            return "{ " + ", ".join(f"{key} = {text(entry)}" for key, entry in value.items()) + " }"
         return json.dumps(value)
 
     return "[record]\n" + "".join(f"{key} = {text(value)}\n" for key, value in table.items())

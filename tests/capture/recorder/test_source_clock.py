@@ -91,15 +91,15 @@ def test_after_half_a_minute_only_the_least_delay_is_left(drift_ppm, rate_hz):
     made = make(drift_ppm=drift_ppm, rate_hz=rate_hz, polled=False)
     late_s, clock = late_of(made, after_s=30)
     assert 0.0003 - 50e-6 < late_s.min() <= late_s.max() < 0.0003 + 50e-6
-    found = clock.result()
-    assert found.drift_ppm == pytest.approx(drift_ppm, abs=1.0)
-    assert abs(found.drift_ppm - drift_ppm) < 4 * found.drift_uncertainty_ppm + 0.05
+    estimate = clock.result()
+    assert estimate.drift_ppm == pytest.approx(drift_ppm, abs=1.0)
+    assert abs(estimate.drift_ppm - drift_ppm) < 4 * estimate.drift_uncertainty_ppm + 0.05
     # Exponential delays: the standard deviation is their mean, 1 % are over ln(100) means. In
     # order, so frames behind a late one are late with it, which at 100 Hz hardly ever happens.
     if rate_hz == 100.0:
-        assert found.jitter_s == pytest.approx(0.002, rel=0.1)
-        assert found.delay_p99_s == pytest.approx(0.002 * np.log(100), rel=0.15)
-    assert (found.own_clock, found.samples, found.resets) == (True, len(made.true), 0)
+        assert estimate.jitter_s == pytest.approx(0.002, rel=0.1)
+        assert estimate.delay_p99_s == pytest.approx(0.002 * np.log(100), rel=0.15)
+    assert (estimate.own_clock, estimate.samples, estimate.resets) == (True, len(made.true), 0)
 
 
 @pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 100.0])
@@ -163,8 +163,8 @@ def test_a_new_estimate_after_a_failure_is_one_reset():
     clock = SourceClock()
     mapped(clock, made)
     clock.restart()
-    found = clock.result()
-    assert (found.resets, found.own_clock, found.drift_ppm) == (1, False, None)
+    estimate = clock.result()
+    assert (estimate.resets, estimate.own_clock, estimate.drift_ppm) == (1, False, None)
 
 
 @pytest.mark.parametrize("first", ["restarts at zero", "is set an hour ahead", "is set back"])
@@ -179,9 +179,9 @@ def test_a_clock_that_is_set_is_measured_anew(first):
     settled = (made.after_s > 30) & ((made.after_s < 40) | (made.after_s > 70))
     assert late_s[settled].max() < 0.0025
     assert late_s.max() < 0.02  # also just after the change: the arrival bounds it
-    found = clock.result()
-    assert found.resets == 1
-    assert found.drift_ppm == pytest.approx(80.0, abs=1.0)
+    estimate = clock.result()
+    assert estimate.resets == 1
+    assert estimate.drift_ppm == pytest.approx(80.0, abs=1.0)
     (event,) = clock.take_events()
     assert ("jumped ahead by" if shift > 0 else "went back by") in event
     assert float(event.split("by ")[1].split(" s")[0]) == pytest.approx(abs(shift) / NS, abs=0.1)
@@ -203,9 +203,9 @@ def test_impossible_times_are_near_their_neighbours_and_change_nothing(odd_ns, f
     odd = np.arange(len(made.true)) % 200 == first
     device = np.where(odd, np.uint64(odd_ns), made.device.astype(np.uint64))
     late_s, clock = late_of(Made(made.true, device, made.host))
-    found = clock.result()
-    assert (found.resets, found.out_of_range) == (0, odd.sum())
-    assert found.drift_ppm == pytest.approx(50.0, abs=2.0)
+    estimate = clock.result()
+    assert (estimate.resets, estimate.out_of_range) == (0, odd.sum())
+    assert estimate.drift_ppm == pytest.approx(50.0, abs=2.0)
     late_s = late_s[made.after_s > 20]
     assert late_s[~odd[made.after_s > 20]].max() < 0.0025
     assert np.abs(late_s).max() < 0.0045  # an impossible time: that of the sample before, 2 ms
@@ -303,10 +303,10 @@ def test_whatever_a_device_reports_times_stay_in_its_order_and_before_their_arri
     host = EPOCH_NS + np.cumsum([step for _, step in made])
     clock = SourceClock()
     parts = zip(np.split(device, sorted(cuts)), np.split(host, sorted(cuts)), strict=True)
-    t_ns = np.concatenate([clock.add(one, other) for one, other in parts])
+    t_ns = np.concatenate([clock.add(device_ns, host_ns) for device_ns, host_ns in parts])
     usable = (device >= 0) & (device < DEVICE_TIMES_END_NS)
-    own = np.diff(device[usable])
-    assert (np.diff(t_ns[usable]) >= np.where((own < 0) & (own >= -JUMP_NS), own, 0)).all()
+    steps = np.diff(device[usable])
+    assert (np.diff(t_ns[usable]) >= np.where((steps < 0) & (steps >= -JUMP_NS), steps, 0)).all()
     assert (t_ns <= host).all()
     assert clock.result().samples == len(made)
 
@@ -350,8 +350,8 @@ def test_the_line_lies_under_all_points_and_nearest(points):
     x = np.cumsum([step + 1 for step, _ in points]) + 0.0
     y = 1e-4 * np.array([height for _, height in points])
     envelope = Envelope(sigma=1e9)  # nothing is expected of the rate
-    for one, other in zip(x, y, strict=True):
-        envelope.take(float(one), float(other))
+    for instant, delay in zip(x, y, strict=True):
+        envelope.take(float(instant), float(delay))
         envelope.close_bucket()
     line = envelope.line
     heights = y - line.offset_ns - line.rate * x

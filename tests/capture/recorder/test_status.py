@@ -49,8 +49,8 @@ SNAPSHOT = RecorderSnapshot(
 
 def of(name="recorder", **changes):
     """One status of a changed snapshot."""
-    (found,) = [s for s in statuses(dataclasses.replace(SNAPSHOT, **changes)) if s.name == name]
-    return found
+    (match,) = [s for s in statuses(dataclasses.replace(SNAPSHOT, **changes)) if s.name == name]
+    return match
 
 
 # -- clocks and schedules -------------------------------------------------------------------------
@@ -99,9 +99,9 @@ def test_tasks_are_spread_over_the_first_second_and_then_each_a_second_apart(cou
 
 
 def test_a_recorder_that_is_well_gives_its_facts():
-    found = of(tick_p99_s=0.002, tick_max_s=0.01, backlog=3, unsynced=7, part=2)
-    assert (found.level, found.message) == (OK, "recording")
-    assert found.values == {
+    status = of(tick_p99_s=0.002, tick_max_s=0.01, backlog=3, unsynced=7, part=2)
+    assert (status.level, status.message) == (OK, "recording")
+    assert status.values == {
         "elapsed_s": "12.346", "state": "recording", "messages": "100", "size_bytes": "2000",
         "free_bytes": "100000", "part": "2", "tick_p99_s": "0.002", "tick_max_s": "0.01",
         "backlog_frames": "3", "unsynced_messages": "7",
@@ -120,10 +120,10 @@ def test_a_recorder_that_is_well_gives_its_facts():
     ],
 )
 def test_a_disk_is_told_of_in_time(left_s, level):
-    found = of(byte_rate=10.0, free=round(10 * left_s))
-    assert found.level == level
+    status = of(byte_rate=10.0, free=round(10 * left_s))
+    assert status.level == level
     text = "recording" if level == OK else f"the disk is full in {left_s:.0f} s"
-    assert found.message == text
+    assert status.message == text
 
 
 @pytest.mark.parametrize(
@@ -146,9 +146,9 @@ def test_ticks_that_take_long_are_a_warning():
 def test_a_session_has_its_verdict_and_eight_reasons():
     reasons = tuple(f"why {k}" for k in range(10))
     for verdict, level in (("good", OK), ("degraded", WARN), ("bad", ERROR)):
-        found = of("session", verdict=verdict, reasons=reasons)
-        assert (found.level, found.message) == (level, f"{verdict}: why 0")
-    assert found.values == {
+        status = of("session", verdict=verdict, reasons=reasons)
+        assert (status.level, status.message) == (level, f"{verdict}: why 0")
+    assert status.values == {
         "verdict": "bad", "reasons": "10", **{f"reason.{k + 1}": f"why {k}" for k in range(8)}
     }  # fmt: skip
     assert of("session").message == "good"
@@ -187,16 +187,16 @@ def test_values_of_a_source():
         load=(0.2, 0.25),
         clock=clock,
     )
-    found = of("source can0", sources=(source,))
-    assert found.hardware_id == "can:socketcan:can0"
-    values = dict(found.values)
+    status = of("source can0", sources=(source,))
+    assert status.hardware_id == "can:socketcan:can0"
+    values = dict(status.values)
     assert {key: values.pop(key) for key in [*values] if not key.startswith("clock_")} == {
         "frames": "7", "rate_hz": "1234.57", "malformed": "2", "error_frames": "1",
         "reconnects": "0", "load": "0.25",
     }  # fmt: skip
     assert values["clock_offset_ns"] == "123"
     assert "load" not in of("source can0", sources=(SOURCE,)).values
-    assert "dropped" not in found.values  # not known
+    assert "dropped" not in status.values  # not known
     assert (
         of("source can0", sources=(dataclasses.replace(SOURCE, dropped=0),)).values["dropped"]
         == "0"
@@ -204,9 +204,9 @@ def test_values_of_a_source():
 
 
 def test_what_is_not_given_of_a_source_or_a_recorder_is_zero_or_left_out():
-    found = of("source b", sources=(SourceSnapshot("b", "x", connected=True),))
+    status = of("source b", sources=(SourceSnapshot("b", "x", connected=True),))
     none = dict.fromkeys(("frames", "malformed", "error_frames", "reconnects"), "0")
-    assert (found.level, found.message, found.values) == (OK, "connected", none)
+    assert (status.level, status.message, status.values) == (OK, "connected", none)
     recorder = of().values
     assert (recorder["backlog_frames"], recorder["unsynced_messages"]) == ("0", "0")
     group = of("topics x", topics=(TopicSnapshot("/x", 1, None, 0.5),)).values
@@ -261,8 +261,8 @@ def test_what_is_wrong_with_a_group_is_named():
 
 def test_topics_without_a_rhythm_have_no_group():
     events = TopicSnapshot("/rosout", 3, 0.1, 5.0)
-    found = statuses(dataclasses.replace(SNAPSHOT, topics=(events,)))
-    assert [one.name for one in found] == ["recorder", "session"]
+    listed = statuses(dataclasses.replace(SNAPSHOT, topics=(events,)))
+    assert [status.name for status in listed] == ["recorder", "session"]
 
 
 # -- ticks ----------------------------------------------------------------------------------------
@@ -272,12 +272,12 @@ def test_durations_of_ticks_are_within_a_bin_of_the_true_quantiles():
     tally = TickTally()
     assert dataclasses.astuple(tally.result()) == (0, 0.0, 0.0, 0.0)
     durations_ns = np.random.default_rng(1).lognormal(15.0, 1.0, 5_000).astype(int)
-    for one in durations_ns.tolist():
-        tally.add(one)
-    found = tally.result()
-    assert found.count == 5_000
-    assert found.max_s == durations_ns.max() * 1e-9
-    for point, part in ((found.p50_s, 0.5), (found.p99_s, 0.99)):
+    for duration in durations_ns.tolist():
+        tally.add(duration)
+    quantiles = tally.result()
+    assert quantiles.count == 5_000
+    assert quantiles.max_s == durations_ns.max() * 1e-9
+    for point, part in ((quantiles.p50_s, 0.5), (quantiles.p99_s, 0.99)):
         true_s = np.quantile(durations_ns, part, method="inverted_cdf") * 1e-9
         assert 1.0 <= point / true_s <= 10 ** (1 / 40) * (1 + 1e-6)
 
@@ -286,6 +286,6 @@ def test_durations_of_ticks_are_within_a_bin_of_the_true_quantiles():
 def test_a_single_tick_is_its_own_quantile_or_the_edge_above(duration_ns):
     tally = TickTally()
     tally.add(duration_ns)
-    found = tally.result()
-    assert found.p50_s == found.p99_s == found.max_s == duration_ns * 1e-9
-    assert math.isfinite(found.p50_s)
+    quantiles = tally.result()
+    assert quantiles.p50_s == quantiles.p99_s == quantiles.max_s == duration_ns * 1e-9
+    assert math.isfinite(quantiles.p50_s)

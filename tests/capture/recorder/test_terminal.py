@@ -88,8 +88,8 @@ def rows(snapshot, width, height=None):
 
 
 def row(lines, first):
-    (found,) = [line for line in lines if line.startswith(first)]
-    return re.split(r"\s{2,}", found.strip())
+    (match,) = [line for line in lines if line.startswith(first)]
+    return re.split(r"\s{2,}", match.strip())
 
 
 # -- what is drawn -----------------------------------------------------------------------------
@@ -156,13 +156,13 @@ texts = st.text(max_size=200)
 
 
 @given(st.integers(40, 200), st.integers(8, 60), texts, texts, texts)
-def test_no_screen_is_wider_than_the_terminal_whatever_names_say(width, height, reason, path, said):
+def test_no_screen_is_wider_than_the_terminal_whatever_names_say(width, height, reason, path, text):
     snapshot = replace(
         SNAPSHOT,
         path=path,
         reasons=(reason, "the second"),
-        events=(EventLine(EPOCH_NS, "warn", path, said),),
-        sources=(replace(CAN, name=said), IMU),
+        events=(EventLine(EPOCH_NS, "warn", path, text),),
+        sources=(replace(CAN, name=text), IMU),
     )
     lines = rows(snapshot, width, height)
     assert max(map(cell_len, lines)) <= width
@@ -212,17 +212,17 @@ def terminal():
         yield ours, stream
 
 
-def read_until(number, wanted):
-    found = b""
+def read_until(number, expected):
+    output = b""
 
     def is_there():
-        nonlocal found
+        nonlocal output
         if select.select([number], [], [], 0)[0]:
-            found += os.read(number, 1 << 16)
-        return wanted.encode() in found
+            output += os.read(number, 1 << 16)
+        return expected.encode() in output
 
-    wait_for(is_there, wanted)
-    return found.decode()
+    wait_for(is_there, expected)
+    return output.decode()
 
 
 @pytest.fixture
@@ -320,17 +320,17 @@ def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once():
     number, other = os.pipe()
     with os.fdopen(other, "w") as stream:
         shown = Terminal(stream)
-        said = ""
+        output = ""
         for second in range(25):
             late = EventLine(EPOCH_NS + 13 * NS, "warn", "can0", "a late one")
             events = (*SNAPSHOT.events, late) if second >= 13 else SNAPSHOT.events
             shown.show(replace(SNAPSHOT, elapsed_s=float(second), events=events))
             if second in (0, 10, 13, 20):  # these are waited for; others may be skipped
-                said += read_until(number, "late one" if second == 13 else f"0:00:{second:02d} ")
+                output += read_until(number, "late one" if second == 13 else f"0:00:{second:02d} ")
         assert shown.close()
     with os.fdopen(number) as rest:
-        said += rest.read()
-    lines = said.splitlines()
+        output += rest.read()
+    lines = output.splitlines()
     times = [line.split()[0] for line in lines if line[0].isdigit()]
     assert times == ["0:00:00", "0:00:10", "0:00:20"]
     assert lines.count("error: imu: the connection is lost") == 1
@@ -372,22 +372,25 @@ def test_the_line_says_what_matters():
 
 
 def test_the_statuses_say_what_the_screen_says():
-    found = {status.name: status for status in statuses(SNAPSHOT)}
+    by_name = {status.name: status for status in statuses(SNAPSHOT)}
     names = "recorder, session, source can0, source imu, topics ir, topics joints"
-    assert list(found) == names.split(", ")
-    assert (found["recorder"].level, found["session"].level) == (OK, WARN)
-    assert found["session"].values["reason.2"] == "reason 1"
-    assert (found["source can0"].level, found["source imu"].level) == (WARN, ERROR)
-    assert found["source can0"].values["clock_drift_ppm"] == "-23.420"
-    assert found["topics ir"].values["topics"] == "15"
-    assert "frozen: joint07" in found["topics joints"].message
+    assert list(by_name) == names.split(", ")
+    assert (by_name["recorder"].level, by_name["session"].level) == (OK, WARN)
+    assert by_name["session"].values["reason.2"] == "reason 1"
+    assert (by_name["source can0"].level, by_name["source imu"].level) == (WARN, ERROR)
+    assert by_name["source can0"].values["clock_drift_ppm"] == "-23.420"
+    assert by_name["topics ir"].values["topics"] == "15"
+    assert "frozen: joint07" in by_name["topics joints"].message
 
 
 def test_a_silent_source_is_stale_and_a_full_disk_an_error():
     snapshot = replace(SNAPSHOT, sources=(replace(CAN, age_s=3.0, dropped=0),), free=1_000_000)
-    found = {status.name: status for status in statuses(snapshot)}
-    assert (found["source can0"].level, found["source can0"].message) == (STALE, "silent for 3 s")
-    recorder = found["recorder"]
+    by_name = {status.name: status for status in statuses(snapshot)}
+    assert (by_name["source can0"].level, by_name["source can0"].message) == (
+        STALE,
+        "silent for 3 s",
+    )
+    recorder = by_name["recorder"]
     assert (recorder.level, recorder.message) == (ERROR, "the disk is full in 28 s")
 
 

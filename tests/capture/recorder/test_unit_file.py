@@ -40,10 +40,10 @@ def unit(tmp_path):
 
 def settings_of(text):
     """Key to all its values, without comments."""
-    found = defaultdict(list)
+    settings = defaultdict(list)
     for key, value in re.findall(r"^([^#=\n]+)=(.*)$", text, re.MULTILINE):
-        found[key].append(value)
-    return found
+        settings[key].append(value)
+    return settings
 
 
 def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
@@ -73,14 +73,14 @@ def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
 
 
 def test_what_the_recorder_relies_on_is_there(unit):
-    found = settings_of(unit.read_text())
-    assert (found["Type"], found["KillSignal"]) == (["notify"], ["SIGTERM"])
-    assert found["Restart"] == ["on-failure"]
-    assert found["AssertPathExists"] == ["/etc/undulog/%i.toml"]
-    assert found["RestartPreventExitStatus"] == ["2"]
-    assert found["RuntimeDirectory"] == found["StateDirectory"] == ["undulog/%i"]
-    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(found["RestrictAddressFamilies"][0].split())
-    assert {"char-ttyACM rw", "char-ttyUSB rw"} <= set(found["DeviceAllow"])
+    settings = settings_of(unit.read_text())
+    assert (settings["Type"], settings["KillSignal"]) == (["notify"], ["SIGTERM"])
+    assert settings["Restart"] == ["on-failure"]
+    assert settings["AssertPathExists"] == ["/etc/undulog/%i.toml"]
+    assert settings["RestartPreventExitStatus"] == ["2"]
+    assert settings["RuntimeDirectory"] == settings["StateDirectory"] == ["undulog/%i"]
+    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(settings["RestrictAddressFamilies"][0].split())
+    assert {"char-ttyACM rw", "char-ttyUSB rw"} <= set(settings["DeviceAllow"])
 
 
 def test_the_program_s_path_stands_in_the_unit():
@@ -111,11 +111,11 @@ def test_a_program_that_the_unit_hides_is_reported(tmp_path):
 # -- the recorder as such a service ---------------------------------------------------------------
 
 
-def heard(manager, wanted):
+def heard(manager, expected):
     """Lines that come to the manager until the wanted one."""
     lines = []
     manager.settimeout(PATIENCE_S)
-    while wanted not in lines:
+    while expected not in lines:
         lines += manager.recv(65536).decode().splitlines()
     return lines
 

@@ -52,9 +52,9 @@ def test_many_instants_at_once_are_the_same_as_one_by_one():
     places = RNG.normal(size=(7, 3))
     position, rotation = kinematics.link_poses(ROBOT, places, heads, angles)
     for k in range(7):
-        one = kinematics.link_poses(ROBOT, places[k], heads[k], angles[k])
-        np.testing.assert_array_equal(position[k], one[0])
-        np.testing.assert_array_equal(rotation[k], one[1])
+        poses = kinematics.link_poses(ROBOT, places[k], heads[k], angles[k])
+        np.testing.assert_array_equal(position[k], poses[0])
+        np.testing.assert_array_equal(rotation[k], poses[1])
 
 
 def test_a_wrong_number_of_angles_is_reported():
@@ -66,10 +66,10 @@ def test_an_angle_that_is_not_known_leaves_what_is_in_front_of_its_joint():
     angles = RNG.normal(scale=0.4, size=(2, 12))
     angles[1, 4] = np.nan
     position, rotation = kinematics.link_poses(ROBOT, np.zeros(3), np.eye(3), angles)
-    known = np.arange(13) <= 4
-    for found in (position[1], rotation[1].reshape(13, 9)):
-        np.testing.assert_array_equal(np.isfinite(found).all(axis=1), known)
-        np.testing.assert_array_equal(np.isnan(found).all(axis=1), ~known)
+    reached = np.arange(13) <= 4
+    for values in (position[1], rotation[1].reshape(13, 9)):
+        np.testing.assert_array_equal(np.isfinite(values).all(axis=1), reached)
+        np.testing.assert_array_equal(np.isnan(values).all(axis=1), ~reached)
     assert np.isfinite(position[0]).all()
     assert np.isfinite(rotation[0]).all()
 
@@ -86,5 +86,5 @@ def test_positions_are_those_of_the_poses():
     angles = RNG.normal(scale=0.4, size=(5, 12))
     heads = Rotation.random(5, rng=RNG).as_matrix()
     position, _ = kinematics.link_poses(ROBOT, RNG.normal(size=3), heads, angles)
-    found = kinematics.link_positions(ROBOT, position[:, 0], heads, angles)
-    np.testing.assert_array_equal(found, position)
+    positions = kinematics.link_positions(ROBOT, position[:, 0], heads, angles)
+    np.testing.assert_array_equal(positions, position)

@@ -101,11 +101,11 @@ def test_a_real_recording_has_slope_one_and_a_lag_of_7_ms(tmp_path, command):
         start = session.start_ns
 
         def column(topic):
-            found = [
+            angles = [
                 (m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec - start * 1e-9, m.position[0])
                 for _, m in session.messages(topic)
             ]
-            return np.array(found).T
+            return np.array(angles).T
 
         (tc, c), (tp, p) = column("/joint_commands"), column("/joint_states")
     inside = (tp >= 3) & (tp <= 10.5)
@@ -116,10 +116,10 @@ def test_a_real_recording_has_slope_one_and_a_lag_of_7_ms(tmp_path, command):
         return rest[0], x[0]
 
     lags = np.arange(0, 0.02, 1e-4)
-    found = [fitted(lag) for lag in lags]
-    best = int(np.argmin([rest for rest, _ in found]))
+    fits = [fitted(lag) for lag in lags]
+    best = int(np.argmin([rest for rest, _ in fits]))
     assert lags[best] == pytest.approx(7.4e-3, abs=2e-4)
-    assert found[best][1] == pytest.approx(1.0, abs=5e-4)
+    assert fits[best][1] == pytest.approx(1.0, abs=5e-4)
     old = load_robot("arcsnake-joint")
     assert decoded(old, frame(0x14B, b"\x92" + b"\x10" * 7))[0] == pytest.approx(
         decoded(load_robot(tmp_path / "rmd.toml"), frame(0x14B, b"\x92" + b"\x10" * 7))[0]

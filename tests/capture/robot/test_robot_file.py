@@ -79,10 +79,10 @@ def test_topics_are_those_of_the_log_contract():
 def test_snake25_has_one_command_and_one_state_frame_a_servo():
     robot = load_robot("snake25")
     for name in robot.joint_names:
-        own = [signal for signal in robot.bus.signals if signal.target == name]
+        signals = [signal for signal in robot.bus.signals if signal.target == name]
         kinds = {(f"{name}_command", model.Direction.TX), (f"{name}_state", model.Direction.RX)}
-        assert {(s.message, s.direction) for s in own} == kinds
-        assert {s.quantity for s in own} >= {model.Quantity.COMMAND, model.Quantity.POSITION}
+        assert {(s.message, s.direction) for s in signals} == kinds
+        assert {s.quantity for s in signals} >= {model.Quantity.COMMAND, model.Quantity.POSITION}
     sensed = {(s.target, s.axis) for s in robot.bus.signals if not s.target.startswith("joint")}
     assert len(sensed) == 15 + 1 + 3 + 2
     database = cantools.database.load_string(robot.databases[0][1], "dbc", strict=True)

@@ -55,12 +55,12 @@ def valid(pieces):
 
 
 def split(protocol, stream, sizes):
-    splitter, found, at = PacketSplitter(protocol), [], 0
+    splitter, pieces, at = PacketSplitter(protocol), [], 0
     for size in sizes:
-        found += splitter.feed(stream[at : at + size])
+        pieces += splitter.feed(stream[at : at + size])
         at += size
-    found += splitter.feed(stream[at:])
-    return found + splitter.feed(b"", silence=True)
+    pieces += splitter.feed(stream[at:])
+    return pieces + splitter.feed(b"", silence=True)
 
 
 def checksum_holds(protocol, packet):
@@ -128,8 +128,8 @@ def test_no_valid_packet_is_lost_and_no_byte(protocol, seed):
     assert b"".join(piece.data for piece in pieces) == stream
     assert [piece.stop for piece in pieces] == np.cumsum([len(p.data) for p in pieces]).tolist()
     assert all(checksum_holds(protocol, data) for data in valid(pieces))
-    found = iter(valid(pieces))
-    lost = [packet.hex(" ") for packet in sent if not any(other == packet for other in found)]
+    packets = iter(valid(pieces))
+    lost = [packet.hex(" ") for packet in sent if not any(other == packet for other in packets)]
     assert not lost
 
 
@@ -160,7 +160,7 @@ def test_a_packet_has_the_time_of_its_last_byte_exactly(baud):
     """Reads of 16 ms with several packets each, one of them across two reads."""
     packets = [feetech_packet(k % 6 + 1, 0, bytes(range(k % 9 + 1))) for k in range(60)]
     stream = b"".join(packets)
-    clock, tally, t_ns, found, stamps = (
+    clock, tally, t_ns, blocks, stamps = (
         PacketClock("feetech", baud),
         Tally(lambda: 0),
         10**18,
@@ -172,8 +172,8 @@ def test_a_packet_has_the_time_of_its_last_byte_exactly(baud):
     for start in reads:
         t_ns += 16_000_000
         stamps.append(t_ns)
-        found.append(clock.feed(stream[start : start + 117], t_ns, tally))
-    records = np.concatenate(found)
+        blocks.append(clock.feed(stream[start : start + 117], t_ns, tally))
+    records = np.concatenate(blocks)
     expected = []
     for end in ends.tolist():
         read = (end - 1) // 117
@@ -198,5 +198,5 @@ def test_long_packets_and_noise_are_kept_in_pieces():
 def test_packets_in_packets_are_judged_once_each():
     """The time doubled with each: forty of them would have taken days."""
     packet = nested_packets(40)
-    found = PacketSplitter("feetech").feed(packet)
-    assert [(piece.data, piece.valid) for piece in found] == [(packet, True)]
+    pieces = PacketSplitter("feetech").feed(packet)
+    assert [(piece.data, piece.valid) for piece in pieces] == [(packet, True)]

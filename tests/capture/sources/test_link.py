@@ -50,9 +50,9 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen):
 
     class Faulty(SocketcanLink):
         def read(self, now_ns):
-            if found := super().read(now_ns):
+            if records := super().read(now_ns):
                 raise ZeroDivisionError("a bug") from None
-            return found
+            return records
 
         def close(self):
             pass  # the test's socket lives on

@@ -42,12 +42,12 @@ def test_twenty_thousand_frames_arrive_as_sent(bus, connect):
         for frame in truth[start : start + 500]:
             bus.send(can_message(frame))
         reader.poll()
-    found = reader.until_frames(len(truth))
-    assert same(found, truth)
+    received = reader.until_frames(len(truth))
+    assert same(received, truth)
     assert reader.source.clock is ClockDomain.HOST
-    assert np.array_equal(found["t_device_ns"], found["t_host_ns"])
-    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
-    assert set(found["dir"].tolist()) == {DIR_RX}
+    assert np.array_equal(received["t_device_ns"], received["t_host_ns"])
+    assert (np.diff(received["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert set(received["dir"].tolist()) == {DIR_RX}
     assert reader.counts.frames == 20_000
     reader.source.stop()
     assert bus.recv(0) is None  # it sent nothing
@@ -73,9 +73,9 @@ def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, connect)
     times = (float("nan"), float("inf"), -1.5, 1e300, 9.3e9, 4611686018.5)
     for k, time_s in enumerate((*times, 5.25)):
         bus.send(can.Message(arbitration_id=k, timestamp=time_s))
-    found = reader.until_frames(len(times) + 1)
-    assert np.array_equal(found["t_device_ns"][:-1], found["t_host_ns"][:-1])
-    assert found["t_device_ns"][-1] == 5_250_000_000
+    received = reader.until_frames(len(times) + 1)
+    assert np.array_equal(received["t_device_ns"][:-1], received["t_host_ns"][:-1])
+    assert received["t_device_ns"][-1] == 5_250_000_000
     assert (reader.counts.malformed, reader.counts.reconnects) == (len(times), 0)
 
 

@@ -190,8 +190,8 @@ def test_decoding_stops_when_its_time_is_over(tmp_path):
         assert name == "whole" or (most <= until_ns + 2 and calls > 20)
     paths = [tmp_path / f"{name}.mcap" for name in ("whole", "bits")]
     for topic in ("/joint_states", "/joint_commands", "/joint_sample_offset"):
-        found = [messages_of(path, topics=[topic]) for path in paths]
-        first, second = (sorted(m.data for *_, m in messages) for messages in found)
+        both = [messages_of(path, topics=[topic]) for path in paths]
+        first, second = (sorted(m.data for *_, m in messages) for messages in both)
         assert first == second
         assert len(first) > 10
 

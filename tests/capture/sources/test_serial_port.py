@@ -25,9 +25,9 @@ from undulog.capture.sources.serial_port import OverrunWatch
 
 @pytest.fixture
 def line(tmp_path):
-    found = Line(tmp_path / "ttyUSB0")
-    yield found
-    found.close()
+    serial_line = Line(tmp_path / "ttyUSB0")
+    yield serial_line
+    serial_line.close()
 
 
 def source_at(tmp_path, query="protocol=feetech"):
@@ -78,8 +78,8 @@ def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(tmp_path, list
     total += len(stream)
     reader.until(lambda: taken() >= total)
     packets, _ = packets_in(reader.fd_frames)
-    found = iter(packets)
-    assert not [packet for packet in sent if not any(other == packet for other in found)]
+    remaining = iter(packets)
+    assert not [packet for packet in sent if not any(other == packet for other in remaining)]
     assert reader.counts.malformed > 100
 
 
@@ -96,11 +96,14 @@ def test_it_never_writes(tmp_path, listen, line):
 
 def _only_readers(path):
     """File numbers of this process that can only read a device."""
-    for one in Path("/proc/self/fd").iterdir():
+    for descriptor in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
-            same = one.readlink() == path.resolve()
-            if same and fcntl.fcntl(int(one.name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
-                yield int(one.name)
+            same = descriptor.readlink() == path.resolve()
+            if (
+                same
+                and fcntl.fcntl(int(descriptor.name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+            ):
+                yield int(descriptor.name)
 
 
 HOLD = """import os, sys, time

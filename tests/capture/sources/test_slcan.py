@@ -134,10 +134,10 @@ def test_twenty_thousand_frames_arrive_as_sent(connect):
     assert reader.source.connected
     assert reader.source.clock is ClockDomain.HOST
     adapter.send(stream(truth))
-    found = reader.until_frames(len(truth))
-    assert same(found, truth)
-    assert np.array_equal(found["t_device_ns"], found["t_host_ns"])
-    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
+    frames = reader.until_frames(len(truth))
+    assert same(frames, truth)
+    assert np.array_equal(frames["t_device_ns"], frames["t_host_ns"])
+    assert (np.diff(frames["t_host_ns"].astype(np.int64)) >= 0).all()
     counts = reader.counts
     assert (counts.frames, counts.malformed, counts.dropped) == (20_000, 0, None)
 
@@ -159,10 +159,10 @@ def test_the_adapters_clock_runs_on_over_the_minute(connect):
     truth = traffic(20_000)
     stamps_ms = 51_234 + 7 * np.arange(len(truth))
     adapter.send(stream(truth, stamps_ms))
-    found = reader.until_frames(len(truth))
-    assert same(found, truth)
+    frames = reader.until_frames(len(truth))
+    assert same(frames, truth)
     assert reader.source.clock is ClockDomain.DEVICE
-    assert np.array_equal(found["t_device_ns"], stamps_ms * 1_000_000)
+    assert np.array_equal(frames["t_device_ns"], stamps_ms * 1_000_000)
     assert commands(adapter) == [b"S6", b"Z1", b"L"]
 
 
@@ -172,8 +172,8 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock():
     true_ms = np.rint(true_s * 1000).astype(int)
     lines = [b"t1230%04X\r" % stamp for stamp in true_ms % STAMP_PERIOD_MS]
     now_ns = [10**18 + int(s * 1e9) for s in true_s]
-    found = [text.feed(line, t, tally)[0] for line, t in zip(lines, now_ns, strict=True)]
-    assert [int(f["t_device_ns"][0]) for f in found] == (true_ms * 10**6).tolist()
+    blocks = [text.feed(line, t, tally)[0] for line, t in zip(lines, now_ns, strict=True)]
+    assert [int(f["t_device_ns"][0]) for f in blocks] == (true_ms * 10**6).tolist()
 
 
 @pytest.mark.parametrize(("asked", "given"), [(True, None), (False, np.arange(50))])
@@ -189,9 +189,9 @@ def test_a_recorder_that_is_held_up_loses_nothing(connect):
     truth = traffic(20_000)  # half a megabyte: several times what the terminal holds
     adapter.send(stream(truth))
     wait_for(lambda: not adapter.queue)  # nobody polls
-    found = reader.until_frames(len(truth))
-    assert same(found, truth)
-    assert len(np.unique(found["t_host_ns"])) > 5  # each stamped when it was read
+    frames = reader.until_frames(len(truth))
+    assert same(frames, truth)
+    assert len(np.unique(frames["t_host_ns"])) > 5  # each stamped when it was read
 
 
 def test_noise_costs_its_own_line_only(connect):
@@ -355,7 +355,7 @@ def test_can_fd_frames_as_python_cans_own_client_writes_them(plug, tmp_path):
     wait_for(lambda: len(lines()) >= len(truth), "all frames")
     sent = lines()
     tally = Tally(lambda: 0)
-    _, found = SlcanText(stamps=False).feed(b"\r".join(sent) + b"\r", 5, tally)
+    _, frames = SlcanText(stamps=False).feed(b"\r".join(sent) + b"\r", 5, tally)
     assert tally.counts.malformed == 0
-    assert same(found, truth)
-    assert same(found, SlcanText(stamps=False).feed(stream(truth), 5, tally)[1])
+    assert same(frames, truth)
+    assert same(frames, SlcanText(stamps=False).feed(stream(truth), 5, tally)[1])

@@ -43,12 +43,12 @@ def test_twenty_thousand_frames_as_packed_by_python_can(pair):
     truth = traffic(20_000)
     tally = Tally(CLOCK.now_ns)
     link = SocketcanLink(ours, tally)
-    found = []
+    blocks = []
     for start in range(0, len(truth), 50):
         for frame in truth[start : start + 50]:
             theirs.send(packed(frame))
-        found += link.read(0)
-    frames = np.concatenate(found)
+        blocks += link.read(0)
+    frames = np.concatenate(blocks)
     assert same(frames, truth)
     assert set(frames["dir"].tolist()) == {DIR_RX}
     assert np.array_equal(frames["t_device_ns"], frames["t_host_ns"])

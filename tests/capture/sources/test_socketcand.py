@@ -109,9 +109,9 @@ def test_many_frames_and_their_times_to_the_microsecond(serve, listen, blank):
     server.stream = messages(truth, blank)
     server.pieces = np.random.default_rng(1).integers(1, 3000, 400).tolist()
     reader = listen(source_at(server.port))
-    found = reader.until_frames(len(truth))
-    assert same(found, truth)
-    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    frames = reader.until_frames(len(truth))
+    assert same(frames, truth)
+    assert np.array_equal(frames["t_device_ns"], truth["t_device_ns"])
     assert reader.source.clock is ClockDomain.DEVICE
     assert reader.counts.malformed == 0
     assert server.requests == [b"< open can0 >", b"< rawmode >"]
@@ -125,9 +125,11 @@ def test_python_cans_own_client_reads_the_same(serve, listen):
     server.go.set()
     theirs, frames = received(bus, len(truth))
     bus.shutdown()
-    found = listen(source_at(server.port)).until_frames(len(truth))
-    assert same(found, frames)
-    assert np.abs(found["t_device_ns"] / 1e9 - np.array([m.timestamp for m in theirs])).max() < 1e-6
+    parsed = listen(source_at(server.port)).until_frames(len(truth))
+    assert same(parsed, frames)
+    assert (
+        np.abs(parsed["t_device_ns"] / 1e9 - np.array([m.timestamp for m in theirs])).max() < 1e-6
+    )
 
 
 def test_error_frames_are_frames_and_events(serve, listen):
@@ -136,11 +138,11 @@ def test_error_frames_are_frames_and_events(serve, listen):
     faults = b"< error 040 1700000001.000001 >< error 020 1700000001.000002 >"
     server.stream = messages(truth[:5]) + faults + messages(truth[5:])
     reader = listen(source_at(server.port))
-    found = reader.until_frames(12)
-    errors = found[5:7]
+    frames = reader.until_frames(12)
+    errors = frames[5:7]
     assert errors["id_flags"].tolist() == [ERROR_FLAG | 0x40, ERROR_FLAG | 0x20]
     assert errors["t_device_ns"].tolist() == [1700000001000001000, 1700000001000002000]
-    assert same(np.delete(found, [5, 6]), truth)
+    assert same(np.delete(frames, [5, 6]), truth)
     assert reader.counts.error_frames == 2
     events = {(event.level, event.text) for event in reader.events[1:]}
     left, lone = "bus-off: the controller left the bus", "error frame: no acknowledgement"
@@ -190,10 +192,10 @@ def test_noise_costs_its_own_message_only():
 def test_other_decimals_and_other_widths():
     text, tally = SocketcandText(), Tally(lambda: 0)
     stream = b"< frame 7 23.4 11 >< frame 123 23.424242 >< frame 00000123 5.123456789 1122 >"
-    found = text.feed(stream, 5, tally)
-    assert found["t_device_ns"].tolist() == [23_400_000_000, 23_424_242_000, 5_123_456_789]
-    assert found["id_flags"].tolist() == [7, 0x123, 0x123 | EXTENDED_FLAG]
-    assert found["dlc"].tolist() == [1, 0, 2]
+    frames = text.feed(stream, 5, tally)
+    assert frames["t_device_ns"].tolist() == [23_400_000_000, 23_424_242_000, 5_123_456_789]
+    assert frames["id_flags"].tolist() == [7, 0x123, 0x123 | EXTENDED_FLAG]
+    assert frames["dlc"].tolist() == [1, 0, 2]
     assert tally.counts.malformed == 0
 
 
@@ -201,8 +203,8 @@ def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted():
     tally = Tally(lambda: 0)
     times = ("-1.5", "nan", "-inf", "1e300", "99999999999.0", "9" * 300, "5.5")
     stream = "".join(f"< frame 123 {time_s} 11 >< rtr 123 {time_s} 3 >" for time_s in times)
-    found = SocketcandText().feed(stream.encode(), 77, tally)
-    assert found["t_device_ns"].tolist() == [77] * 2 * 6 + [5_500_000_000] * 2
+    frames = SocketcandText().feed(stream.encode(), 77, tally)
+    assert frames["t_device_ns"].tolist() == [77] * 2 * 6 + [5_500_000_000] * 2
     assert tally.counts.malformed == 12
 
 

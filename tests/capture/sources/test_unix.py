@@ -91,11 +91,11 @@ def peer(path):
 def test_twenty_thousand_frames_of_a_foreign_process(path, reader, per_packet, head):
     truth = foreign_truth(0, 20_000)
     with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
-        found = reader.until_frames(20_000)
+        received = reader.until_frames(20_000)
         assert process.wait() == 0
-    assert same(found, truth)
-    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
-    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert same(received, truth)
+    assert np.array_equal(received["t_device_ns"], truth["t_device_ns"])
+    assert (np.diff(received["t_host_ns"].astype(np.int64)) >= 0).all()
     assert reader.counts.frames == 20_000
     assert reader.counts.dropped == (0 if head else None)
     reader.until_event("disconnected")
@@ -107,12 +107,12 @@ def test_what_our_sender_offers_arrives(tmp_path, path, reader):
     truth = traffic(20_000)
     np.save(tmp_path / "frames.npy", truth)
     with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
-        found = reader.until_frames(20_000)
+        received = reader.until_frames(20_000)
         accepted, refused = json.loads(process.communicate()[0])
     reader.until_event("disconnected")
     assert accepted == 20_000
-    assert same(found, truth)
-    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    assert same(received, truth)
+    assert np.array_equal(received["t_device_ns"], truth["t_device_ns"])
     before = 0 if reader.counts.dropped == refused else refused
     assert reader.counts.dropped == refused - before  # refused before it was connected
 
@@ -189,19 +189,19 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(reader, peer, context):
         sock.send(record)
         bounds.append((before_ns, context.now_ns()))
     wait_for(lambda: context.now_ns() > bounds[-1][1] + 50_000_000, "a later time")
-    found = reader.until_frames(20)
+    received = reader.until_frames(20)
     slack_ns = 1_000_000  # two clocks are read one after the other
-    for t_ns, (low_ns, high_ns) in zip(found["t_host_ns"].tolist(), bounds, strict=True):
+    for t_ns, (low_ns, high_ns) in zip(received["t_host_ns"].tolist(), bounds, strict=True):
         assert low_ns - slack_ns <= t_ns <= high_ns + slack_ns
 
 
 def test_two_senders_are_put_in_the_order_of_arrival(reader, peer):
-    one, two = peer(), peer()
+    first, second = peer(), peer()
     reader.until(lambda: len(reader.source._senders) == 2)
     frames = empty_frames(40)
     frames["id_flags"] = np.arange(40)
     for number in range(40):
-        (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
+        (first, second)[number % 3 == 0].send(frames[number : number + 1].tobytes())
     senders = reader.source._senders
     wait_for(lambda: not any(sender.receiver.pending for sender in senders), "both threads")
     assert reader.until_frames(40)["id_flags"].tolist() == list(range(40))

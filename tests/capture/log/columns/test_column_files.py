@@ -32,22 +32,22 @@ def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def assert_true(found, values):
+def assert_true(columns, values):
     for field, factor in zip(WANTED["/joint_states"], (1, -1, 2), strict=True):
-        signals = found["/joint_states", field]
+        signals = columns["/joint_states", field]
         assert signals.names == tuple(NAMES)
         assert np.array_equal(np.transpose(signals.values), factor * values)
 
 
 def test_columns_in_files_leave_memory_and_come_back(session_path, values, tmp_path):
     with Session.open(session_path, column_folder=tmp_path) as session:
-        found = session.joint_columns(WANTED)
+        columns = session.joint_columns(WANTED)
         assert list(tmp_path.iterdir()) == []  # the files have no names
-        assert_true(found, values)
+        assert_true(columns, values)
         before = resident()
         session.forget()
         assert before - resident() > 0.8 * 3 * COLUMN_BYTES
-    assert_true(found, values)  # a closed session's columns stay, too
+    assert_true(columns, values)  # a closed session's columns stay, too
 
 
 @pytest.mark.parametrize("disk", [None, "1m"])
@@ -56,9 +56,9 @@ def test_columns_in_memory_stay_as_those_without_room_on_the_disk(
 ):
     folder = None if disk is None else request.getfixturevalue("disk_of")(disk)
     with Session.open(session_path, column_folder=folder) as session:
-        found = session.joint_columns(WANTED)
+        columns = session.joint_columns(WANTED)
         session.forget()
-    assert_true(found, values)
+    assert_true(columns, values)
 
 
 def test_columns_in_files_can_be_written_to(session_path, tmp_path):

@@ -40,15 +40,15 @@ def write_session(path, ticks, *, stall=None):
 def test_one_pass_gives_what_each_reader_gives(tmp_path):
     path = tmp_path / "s.mcap"
     t_ns, values = write_session(path, 5000)
-    wanted = {"/joint_states": ["position", "velocity"], "/joint_current": ["position"]}
+    selection = {"/joint_states": ["position", "velocity"], "/joint_current": ["position"]}
     with Session(path) as session:
-        signals, tables = session.columns(wanted, {"/imu": ["linear_acceleration.z"]})
+        signals, tables = session.columns(selection, {"/imu": ["linear_acceleration.z"]})
         table = session.table("/imu")
-    keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
+    keys = [(topic, field) for topic, fields in selection.items() for field in fields]
     for key, scale in zip(keys, (1, -1, 2), strict=True):
-        found = signals[key]
-        np.testing.assert_array_equal(np.array(found.values).T, scale * values)
-        np.testing.assert_array_equal(np.array(found.t_ns).T, t_ns)
+        series = signals[key]
+        np.testing.assert_array_equal(np.array(series.values).T, scale * values)
+        np.testing.assert_array_equal(np.array(series.t_ns).T, t_ns)
     assert list(tables["/imu"].columns) == ["linear_acceleration.z"]
     assert tables["/imu"].equals(table[["linear_acceleration.z"]])
     np.testing.assert_array_equal(tables["/imu"]["linear_acceleration.z"], values[:, 2])
@@ -56,15 +56,15 @@ def test_one_pass_gives_what_each_reader_gives(tmp_path):
 
 def test_offsets_that_are_asked_for_are_not_overwritten(tmp_path):
     t_ns, _ = write_session(tmp_path / "s.mcap", 50)
-    wanted = {"/joint_states": ["position"], "/joint_sample_offset": ["position"]}
+    selection = {"/joint_states": ["position"], "/joint_sample_offset": ["position"]}
     with Session(tmp_path / "s.mcap") as session:
-        found = session.joint_columns(wanted)
+        columns = session.joint_columns(selection)
         with pytest.raises(DataError, match="not for both"):
             session.columns({"/joint_states": ["position"]}, {"/joint_sample_offset": None})
     stamps = EPOCH_NS + np.arange(50) * STEP_NS
-    offsets = np.array(found["/joint_sample_offset", "position"].values)
+    offsets = np.array(columns["/joint_sample_offset", "position"].values)
     np.testing.assert_allclose(offsets, (t_ns.T - stamps) * 1e-9, atol=1e-9)
-    np.testing.assert_array_equal(np.array(found["/joint_states", "position"].t_ns).T, t_ns)
+    np.testing.assert_array_equal(np.array(columns["/joint_states", "position"].t_ns).T, t_ns)
 
 
 @pytest.mark.parametrize("stall", [None, 1500])
@@ -76,11 +76,11 @@ def test_a_window_is_what_the_whole_has_of_it(tmp_path, stall):
         for start in [0, 1450, 1550, 1790, *rng.integers(0, 3900, 20).tolist()]:
             start_ns = EPOCH_NS + start * STEP_NS + 3_000_000
             stop_ns = start_ns + int(rng.integers(1, 100)) * STEP_NS
-            found = session.joints("/joint_states", start_ns=start_ns, stop_ns=stop_ns)
+            series = session.joints("/joint_states", start_ns=start_ns, stop_ns=stop_ns)
             for j in range(5):
                 inside = (t_ns[:, j] >= start_ns) & (t_ns[:, j] < stop_ns)
-                np.testing.assert_array_equal(found.t_ns[j], t_ns[inside, j])
-                np.testing.assert_array_equal(found.values[j], values[inside, j])
+                np.testing.assert_array_equal(series.t_ns[j], t_ns[inside, j])
+                np.testing.assert_array_equal(series.values[j], values[inside, j])
 
 
 def test_frames_come_in_the_order_they_were_logged(tmp_path):
@@ -96,17 +96,17 @@ def test_frames_come_in_the_order_they_were_logged(tmp_path):
             order.append((late, tick, frames["id_flags"].tolist()))
             channel.write(late, frames)
     with Session(tmp_path / "s.mcap") as session:
-        found = session.frames("/can/can0")["id_flags"].tolist()
-    assert found == [number for _, _, batch in sorted(order) for number in batch]
+        numbers = session.frames("/can/can0")["id_flags"].tolist()
+    assert numbers == [number for _, _, batch in sorted(order) for number in batch]
 
 
 def test_own_times_of_series_that_are_stamped_differently():
     stamps = np.array([100, 200, 300, 400])
     offsets = JointSeries(("a",), [stamps], [np.array([1e-9, 2e-9, np.nan, 4e-9])])
     series = JointSeries(("a", "b"), [np.array([50, 250, 350])] * 2, [np.zeros(3)] * 2)
-    (own,) = own_times([series], offsets)
-    assert own[0].tolist() == [51, 252, 350]
-    assert own[1].tolist() == [50, 250, 350]
+    (own_ns,) = own_times([series], offsets)
+    assert own_ns[0].tolist() == [51, 252, 350]
+    assert own_ns[1].tolist() == [50, 250, 350]
 
 
 def test_stores_grow_and_keep_far_log_times():
@@ -167,8 +167,8 @@ def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_pa
             for k, channel in enumerate(channels):
                 chance = rng.random() if tick > 100 * k else 1.0
                 if chance > 0.02:  # one in fifty is missing, one has a stamp of its own
-                    own = t_ns + k if chance < 0.04 else t_ns
-                    channel.write(own, rng.random(), log_time_ns=t_ns + 5 * (chance < 0.06))
+                    stamp = t_ns + k if chance < 0.04 else t_ns
+                    channel.write(stamp, rng.random(), log_time_ns=t_ns + 5 * (chance < 0.06))
             if tick % 2:
                 field.write(t_ns, rng.normal(size=3))
     with Session(path) as session:

@@ -54,23 +54,23 @@ def small_arenas(monkeypatch):
 
 
 def helpers_alive():
-    return [each for each in threading.enumerate() if each.name.startswith("undulog-helper")]
+    return [thread for thread in threading.enumerate() if thread.name.startswith("undulog-helper")]
 
 
 def signals(path, threads, **window):
     """All signals, and what is warned of."""
     with Session(path, threads=threads) as session:
-        found = session.joint_columns(dict.fromkeys(TOPICS, FIELDS), **window)
+        columns = session.joint_columns(dict.fromkeys(TOPICS, FIELDS), **window)
         warnings = session.warnings
     assert not helpers_alive()
-    return found, warnings
+    return columns, warnings
 
 
 def read(path, threads, **window):
     """All signals as one array of times and one of values, and what is warned of."""
-    found, warnings = signals(path, threads, **window)
-    times = np.array([signals.t_ns for signals in found.values()])
-    return times, np.array([signals.values for signals in found.values()]), warnings
+    columns, warnings = signals(path, threads, **window)
+    times = np.array([signals.t_ns for signals in columns.values()])
+    return times, np.array([signals.values for signals in columns.values()]), warnings
 
 
 def truth(ticks):
@@ -117,21 +117,21 @@ def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_p
     for block in harmed:
         data[(block.start + block.stop) // 2] ^= 0x55
     path.write_bytes(data)
-    found, warnings = signals(path, 1)
+    columns, warnings = signals(path, 1)
     texts = [f"the chunk at byte {block.start} can't be decompressed" for block in harmed]
     assert all(any(text in warning for warning in warnings) for text in texts)
     assert ["; its messages are missing" in text for text in warnings] == [True] * len(harmed)
-    expected = dict(zip(found, truth(10_000)[1], strict=True))
-    for key, each in found.items():
-        ticks = (each.t_ns[0] - EPOCH_NS) // STEP_NS
+    expected = dict(zip(columns, truth(10_000)[1], strict=True))
+    for key, series in columns.items():
+        ticks = (series.t_ns[0] - EPOCH_NS) // STEP_NS
         assert 5000 < len(ticks) < 10_000
-        np.testing.assert_array_equal(np.array(each.values), expected[key][:, ticks])
+        np.testing.assert_array_equal(np.array(series.values), expected[key][:, ticks])
     for threads in (2, 4):
         again, complaints = signals(path, threads)
         assert complaints == warnings
-        for key, each in found.items():
-            np.testing.assert_array_equal(np.array(again[key].t_ns), np.array(each.t_ns))
-            np.testing.assert_array_equal(np.array(again[key].values), np.array(each.values))
+        for key, series in columns.items():
+            np.testing.assert_array_equal(np.array(again[key].t_ns), np.array(series.t_ns))
+            np.testing.assert_array_equal(np.array(again[key].values), np.array(series.values))
 
 
 @pytest.mark.parametrize("threads", [1, 4])
@@ -250,6 +250,6 @@ print(status("VmHWM") - before - sum(arrays.values()) - path.stat().st_size)
 def test_beyond_the_arrays_and_the_file_a_reader_needs_little(tmp_path, threads):
     path = tmp_path / "s.mcap"
     write_session(path, 150_000)  # some 200 MB of arrays
-    wanted = json.dumps(dict.fromkeys(TOPICS, FIELDS))
-    done = python(MEASURE, path, threads, wanted, EPOCH_NS + 10**9)
+    selection = json.dumps(dict.fromkeys(TOPICS, FIELDS))
+    done = python(MEASURE, path, threads, selection, EPOCH_NS + 10**9)
     assert int(done.stdout) <= 64 * MIB, done.stderr

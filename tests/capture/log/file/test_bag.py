@@ -28,10 +28,10 @@ def filled(bag, rows=slice(None)):
 
 def check(path):
     with Session.open(path) as session:
-        found = session.joints("/joint_states")
+        series = session.joints("/joint_states")
         assert session.path == path
-        np.testing.assert_array_equal(found.t_ns, np.stack([TIMES_NS, TIMES_NS]))
-        np.testing.assert_array_equal(found.values, TRUTH.T)
+        np.testing.assert_array_equal(series.t_ns, np.stack([TIMES_NS, TIMES_NS]))
+        np.testing.assert_array_equal(series.values, TRUTH.T)
 
 
 @MODES
@@ -86,11 +86,11 @@ def test_a_mutated_bag_reads_or_is_refused_in_words(storage, compression, cases,
         for place in draw.integers(len(data), size=1 + case):
             data[place] = draw.integers(256)
         path.write_bytes(data)
-        said = str(bag)
+        message = str(bag)
         try:
             with Session.open(bag) as session:
                 session.joints("/joint_states")
         except UndulogError as error:
-            said = str(error)
-        assert str(bag) in said
+            message = str(error)
+        assert str(bag) in message
         path.write_bytes(whole[path])

@@ -39,7 +39,7 @@ OTHERS = [
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [*((text, True) for text in RECORDINGS), *((each, False) for each in OTHERS)],
+    [*((text, True) for text in RECORDINGS), *((text, False) for text in OTHERS)],
 )
 def test_a_folder_is_a_recording_by_the_key(text, expected, tmp_path):
     (tmp_path / "metadata.yaml").write_bytes(text.encode())

@@ -318,8 +318,8 @@ def test_an_exchanged_part_is_found_and_one_of_another_session_is_left_out(tmp_p
         sink.split()
         channel.write(EPOCH_NS, "1")
     (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
-    found, warnings = read(tmp_path / "run.mcap")
-    assert found == recorder.truth(900)[:300] + recorder.truth(900)[600:]
+    messages, warnings = read(tmp_path / "run.mcap")
+    assert messages == recorder.truth(900)[:300] + recorder.truth(900)[600:]
     assert warnings == ["run_0002.mcap is of another session: left out"]
 
 
@@ -336,6 +336,6 @@ def test_edits_take_all_parts_and_damage_names_its_part(tmp_path):
     second.write_bytes(raw)
     health = check_session(path)
     assert any(text.startswith("run_0002.mcap: the chunk at byte") for text in health.file.damage)
-    found, warnings = read(path)
-    assert len(found) == 600
+    messages, warnings = read(path)
+    assert len(messages) == 600
     assert any("run_0002.mcap" in text for text in warnings)

@@ -32,8 +32,8 @@ def write(tmp_path):
 
 
 def joint_of(health, name, topic="/joint_states"):
-    (found,) = [joint for joint in health.joints if (joint.topic, joint.name) == (topic, name)]
-    return found
+    (match,) = [joint for joint in health.joints if (joint.topic, joint.name) == (topic, name)]
+    return match
 
 
 # -- the clean twin ----------------------------------------------------------------------------
@@ -59,12 +59,12 @@ def test_a_clean_session_is_good_without_a_finding(clean, command):
 
 @pytest.mark.slow
 def test_json_is_one_object_and_has_whether_the_stored_verdict_differs(write, command):
-    found = json.loads(command("log", "check", write(verdict="bad"), "--json").out)
-    assert found["verdict"] == "good"
+    report = json.loads(command("log", "check", write(verdict="bad"), "--json").out)
+    assert report["verdict"] == "good"
     stored = {"verdict": "bad", "reasons": ["as the recorder had it"], "differs": True}
-    assert found["stored"] == stored
-    assert len(found["joints"]) == 2 * len(NAMES)
-    assert found["series"][0]["timing"]["rate_hz"] == pytest.approx(100.0)
+    assert report["stored"] == stored
+    assert len(report["joints"]) == 2 * len(NAMES)
+    assert report["series"][0]["timing"]["rate_hz"] == pytest.approx(100.0)
 
 
 # -- planted in the rhythm ---------------------------------------------------------------------
@@ -144,12 +144,12 @@ def test_blocks_don_t_change_a_timing(steps, cuts):
     whole.add(t_ns)
     for part in np.split(t_ns, sorted(cuts)):
         pieces.add(part)
-    one, many = whole.result(), pieces.result()
-    assert (one.count, one.gaps, one.missing) == (many.count, many.gaps, many.missing)
-    assert one.median_s == pytest.approx(many.median_s)
-    assert one.longest_s == many.longest_s == max(steps) / 1e9
+    single, many = whole.result(), pieces.result()
+    assert (single.count, single.gaps, single.missing) == (many.count, many.gaps, many.missing)
+    assert single.median_s == pytest.approx(many.median_s)
+    assert single.longest_s == many.longest_s == max(steps) / 1e9
     median_s = np.quantile(steps, 0.5, method="inverted_cdf") / 1e9
-    assert one.median_s == pytest.approx(median_s, rel=0.011)
+    assert single.median_s == pytest.approx(median_s, rel=0.011)
 
 
 # -- sequence numbers ------------------------------------------------------------------------------

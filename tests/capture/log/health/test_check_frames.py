@@ -51,10 +51,12 @@ def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path):
             frames["dlc"] = 8
             bus.write(at(k), frames)
     health = check_session(path)
-    (found,) = health.buses
-    assert found.frames == sizes.sum()
-    assert found.load is not None
-    none = f"none of {found.frames} CAN frames can be decoded: the bus map of {ROBOT.name} does"
+    (checked_bus,) = health.buses
+    assert checked_bus.frames == sizes.sum()
+    assert checked_bus.load is not None
+    none = (
+        f"none of {checked_bus.frames} CAN frames can be decoded: the bus map of {ROBOT.name} does"
+    )
     assert any(sentence.startswith(none) for sentence in health.reasons)
 
 

@@ -17,17 +17,19 @@ def bag(tmp_path):
         fill = Filler(bag)
         for t_ns, t_s in ticks(12.0):
             fill.state(t_ns, t_s, "/arm/goal", commanded(t_s))
-            found = answered(t_s)
+            angles = answered(t_s)
             if 4.0 <= t_s < 8.0:
-                found[1] = 0.1
-            fill.state(t_ns, t_s, "/arm/encoders", found)
+                angles[1] = 0.1
+            fill.state(t_ns, t_s, "/arm/encoders", angles)
             fill.state(t_ns, t_s)
 
     return write_bag(tmp_path / "arm", fill)
 
 
 def frozen(report, topic):
-    return {one["name"]: one["frozen_s"] for one in report["joints"] if one["topic"] == topic}
+    return {
+        joint["name"]: joint["frozen_s"] for joint in report["joints"] if joint["topic"] == topic
+    }
 
 
 def test_the_chosen_topics_are_those_that_are_judged(bag, report_of):

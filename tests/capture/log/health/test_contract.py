@@ -22,7 +22,7 @@ ROBOT = load_robot("arcsnake-joint")
 def joints(names=(JOINT,), positions=(0.1,), velocity=(), stamp_ns=START_NS):
     stamp = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
     header = STORE.types["std_msgs/msg/Header"](stamp, "")
-    arrays = [np.array(one, float) for one in (positions, velocity, ())]
+    arrays = [np.array(values, float) for values in (positions, velocity, ())]
     return STORE.types[JOINTS](header, list(names), *arrays)
 
 
@@ -98,7 +98,10 @@ class Log:
 
 
 def broken(log, path):
-    return [(one.rule, one.where, str(one)) for one in check_contract(log.write(path))]
+    return [
+        (violation.rule, violation.where, str(violation))
+        for violation in check_contract(log.write(path))
+    ]
 
 
 def test_a_foreign_log_that_follows_the_contract(tmp_path):
@@ -167,8 +170,8 @@ STRING = STORE.types["std_msgs/msg/String"]("walk")
     ],
 )
 def test_a_violation_is_named_with_its_fix(change, rule, where, fix, tmp_path):
-    ((found, place, line),) = broken(Log(**change), tmp_path / "a.mcap")
-    assert found == rule
+    ((broken_rule, place, line),) = broken(Log(**change), tmp_path / "a.mcap")
+    assert broken_rule == rule
     assert where in place
     assert fix in line
 
@@ -203,7 +206,7 @@ def test_the_command_prints_them_and_ends_with_1(tmp_path, command):
     assert lines[1].startswith("  unit: /joint_states: channel metadata unit: found nothing")
     report = json.loads(command("log", "check", "--contract", path, "--json", code=1).out)
     assert report["follows"] is False
-    assert [one["rule"] for one in report["violations"]] == ["unit"]
+    assert [violation["rule"] for violation in report["violations"]] == ["unit"]
     good = Log().write(tmp_path / "b.mcap")
     assert "follows all" in command("log", "check", "--contract", good).out
     table = command("log", "check", "--contract", path, good, code=1).out

@@ -64,9 +64,9 @@ def test_samples_dropped_at_random_are_missing(seed, part, sigma):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_single_loss_is_missing(seed, length, sigma):
     stamps = np.delete(jittered(np.random.default_rng(seed), sigma), slice(3000, 3000 + length))
-    found = timing(stamps)
-    assert (found.gaps, found.late) == (1, 0)
-    assert found.missing == length
+    rhythm = timing(stamps)
+    assert (rhythm.gaps, rhythm.late) == (1, 0)
+    assert rhythm.missing == length
 
 
 @pytest.mark.parametrize("loop", [{}, {"sleeps": True}], ids=["catches up", "sleeps"])
@@ -77,9 +77,9 @@ def test_losses_are_found_beside_late_cycles(chance, mean, loop):
     for seed in range(11):
         rng = np.random.default_rng(seed)
         stamps = driver(rng, chance, mean, **loop)[kept := rng.random(CYCLES) >= 0.05]
-        found = timing(stamps)
-        assert found.missing_part > 0.03
-        ratios.append(found.missing / (CYCLES - kept.sum()))
+        rhythm = timing(stamps)
+        assert rhythm.missing_part > 0.03
+        ratios.append(rhythm.missing / (CYCLES - kept.sum()))
     assert min(ratios) > 0.8
     assert np.median(ratios) < 1.6
     assert max(ratios) < 2.0
@@ -95,40 +95,40 @@ def test_losses_are_found_beside_late_cycles(chance, mean, loop):
 def test_late_cycles_are_not_missing(chance, mean, loop):
     called_lost = 0
     for seed in range(20):
-        found = timing(driver(np.random.default_rng(seed), chance, mean, **loop))
-        assert found.late + found.missing >= found.gaps > 0
-        called_lost += found.missing > 0
+        rhythm = timing(driver(np.random.default_rng(seed), chance, mean, **loop))
+        assert rhythm.late + rhythm.missing >= rhythm.gaps > 0
+        called_lost += rhythm.missing > 0
     assert called_lost <= 3, "chance puts more gaps on the grid in one of twenty"
 
 
 def test_jitter_is_no_loss():
     for seed in SEEDS:
-        found = timing(jittered(np.random.default_rng(seed), 0.2))
-        assert (found.missing, found.late) == (0, found.gaps)
-        assert found.gaps > 100
+        rhythm = timing(jittered(np.random.default_rng(seed), 0.2))
+        assert (rhythm.missing, rhythm.late) == (0, rhythm.gaps)
+        assert rhythm.gaps > 100
 
 
 @pytest.mark.parametrize("length", [50, 200])
 def test_a_stall_followed_by_a_burst_is_no_loss(length):
     stamps = GRID.copy()
     stamps[3000 : 3000 + length] = 2999.7 + length + 0.003 * np.arange(length)
-    found = timing(stamps)
-    assert (found.gaps, found.late, found.missing) == (1, 1, 0)
+    rhythm = timing(stamps)
+    assert (rhythm.gaps, rhythm.late, rhythm.missing) == (1, 1, 0)
 
 
 def test_a_burst_within_one_stamp_is_no_loss():
     stamps = GRID.copy()
     for start in range(500, CYCLES, 500):
         stamps[start : start + 12] = start + 11  # on the grid, as the cycle of a robot takes them
-    found = timing(stamps)
-    assert (found.gaps, found.late, found.missing) == (11, 11, 0)
-    assert found.duplicates == 11 * 11
+    rhythm = timing(stamps)
+    assert (rhythm.gaps, rhythm.late, rhythm.missing) == (11, 11, 0)
+    assert rhythm.duplicates == 11 * 11
 
 
 @pytest.mark.parametrize("length", [5.4, 50.37, 200.37])
 def test_a_stall_that_shifts_what_follows_is_no_loss(length):
-    found = timing(np.where(GRID < 3000, GRID, GRID + length))
-    assert (found.gaps, found.late, found.missing) == (1, 1, 0)
+    rhythm = timing(np.where(GRID < 3000, GRID, GRID + length))
+    assert (rhythm.gaps, rhythm.late, rhythm.missing) == (1, 1, 0)
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 400), max_size=4))
@@ -229,8 +229,8 @@ def test_only_counters_that_exclude_a_loss_make_a_skipped_cycle(counters, sequen
         channel("/joint_states", "none", None, None),
     ]
     sources = [SourceHealth(f"can{k}", 9, **counter) for k, counter in enumerate(counters)]
-    found = with_skipped_cycles(every, channels, sources, "/joint_commands")
-    missing = [each.timing.missing for each in found]
+    all_series = with_skipped_cycles(every, channels, sources, "/joint_commands")
+    missing = [series.timing.missing for series in all_series]
     assert missing == ([0, 0, 4] if proved else [4, 4, 4])
 
 
@@ -239,5 +239,5 @@ def test_losses_of_a_session_s_states_stay_losses_beside_whole_commands():
     every = [series("/joint_commands", commands), series("/joint_states", states)]
     channels = [channel("/joint_commands", "counted", 0, 0)]
     sources = [SourceHealth("can0", 9, **SOURCE)]
-    found = with_skipped_cycles(every, channels, sources, "/joint_commands")
-    assert [each.timing.missing for each in found] == [0, 2]
+    all_series = with_skipped_cycles(every, channels, sources, "/joint_commands")
+    assert [series.timing.missing for series in all_series] == [0, 2]

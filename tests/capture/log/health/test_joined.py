@@ -62,7 +62,7 @@ def test_the_figures_are_those_of_the_worst():
         ChannelFault(0, "/c", "", "a note", 1, gap, 0.001),
         ChannelFault(1, "/d", "", "two gaps", 2, gap, 0.02),
     ]
-    assert [(one.weight, one.sentence) for one in joined(faults)] == [
+    assert [(reason.weight, reason.sentence) for reason in joined(faults)] == [
         (1, "/a and /b, lost together: at most 9 of it"),
         (0, "/c: a note"),
         (1, "/d: two gaps"),
@@ -75,7 +75,7 @@ def test_joints_that_differ_have_reasons_of_their_own():
         for topic in ("/x", "/y")
         for name in ("j1", "j2", "j3")
     ]
-    assert [one.sentence for one in joined(faults)] == [
+    assert [reason.sentence for reason in joined(faults)] == [
         "/x and /y, j1 and j3, each: 1 of 400",
         "/x and /y, j2, each: 3 of 400",
     ]

@@ -68,11 +68,11 @@ def run(*commands, most=ROOM):
 
     listed = json.dumps([[str(word) for word in command] for command in commands])
     env = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    used, found = json.loads(python(script, listed, preexec_fn=limited, env=env, code=0).stdout)
+    used, outputs = json.loads(python(script, listed, preexec_fn=limited, env=env, code=0).stdout)
     assert used < most, f"{used / MIB:.0f} MiB"
-    for command, (code, _) in zip(commands, found, strict=True):
+    for command, (code, _) in zip(commands, outputs, strict=True):
         assert code == 0 or "check" in command, command
-    return [printed for _, printed in found]
+    return [printed for _, printed in outputs]
 
 
 BOMBS = {
@@ -99,11 +99,11 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(t
     )
     count = len(places)
     starts = [0, 3] if whole else [0]
-    wanted = [t_ns for start in starts for _, t_ns, _ in ticks(start)]
+    times = [t_ns for start in starts for _, t_ns, _ in ticks(start)]
     for k, (path, at) in enumerate(places.items()):
         assert "chunk" in printed[k], path
         recovered = messages_of(path.with_suffix(".recovered.mcap"))
-        assert [message.log_time for _, _, message in recovered] == wanted, path
+        assert [message.log_time for _, _, message in recovered] == times, path
         health = json.loads(printed[count + k])
         if whole:
             assert health["verdict"] == "bad", path

@@ -120,11 +120,11 @@ def test_helper_threads_change_no_byte(calls, chunk_size, waiting):
 
 def numbers_in(stream):
     """Sequence numbers of the messages of a file that has no end yet."""
-    found = []
+    numbers = []
     with contextlib.suppress(EndOfFile):
         for record in StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records:
-            found += [record.sequence] if isinstance(record, Message) else []
-    return found
+            numbers += [record.sequence] if isinstance(record, Message) else []
+    return numbers
 
 
 @settings(max_examples=50, deadline=None)
@@ -217,8 +217,8 @@ def test_groups_have_chunks_of_their_own_and_what_is_settled_is_in_the_file(
         assert set(range(writer.settled)) <= set(numbers_in(stream))
     writer.finish()
     reader = make_reader(io.BytesIO(stream.getvalue()))
-    found = [(c.id, m.sequence, m.data) for _, c, m in reader.iter_messages()]
-    assert found == [(ids[c], k, b"%d" % k * (c + 1)) for k, c in enumerate(channels)]
+    messages = [(c.id, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+    assert messages == [(ids[c], k, b"%d" % k * (c + 1)) for k, c in enumerate(channels)]
     for chunk in reader.get_summary().chunk_indexes:
         topics = [key for key in chunk.message_index_offsets if ids.index(key) % 2 == 0]
         assert not topics or list(chunk.message_index_offsets) == topics[:1]

@@ -88,8 +88,8 @@ def assert_same(ours, other):
     ],
 )
 def test_a_url_is_a_path_whose_text_has_no_query(given, text, name):
-    for each in (given, Path(given), as_path(given)):  # as the command line makes them
-        path = as_path(each)
+    for address in (given, Path(given), as_path(given)):  # as the command line makes them
+        path = as_path(address)
         assert isinstance(path, RemotePath)
         assert (str(path), path.name, path.suffix) == (text, name, ".mcap")
         assert str(path.with_name("other.mcap")) == text.removesuffix(name) + "other.mcap"
@@ -139,7 +139,7 @@ def test_a_window_fetches_a_part_and_a_second_look_nothing(chunked):
     window = {"start_ns": T0 + 40_000_000_000, "stop_ns": T0 + 41_000_000_000}
     with both(chunked) as (server, far, near):
         opened = server.sent
-        got, want = (one.joints("/joint_states", **window) for one in (far, near))
+        got, want = (session.joints("/joint_states", **window) for session in (far, near))
         assert all(map(np.array_equal, got.values, want.values))
         fetched = server.sent
         assert fetched - opened < 0.35 * near.size

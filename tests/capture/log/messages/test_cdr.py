@@ -101,8 +101,8 @@ def test_constants_defaults_bounds_and_nested_packages_parse():
     text = "uint8 A=1\nstring<=8 s 'x'\nfloat64[3] v\nint32[<=4] w\nOther o  # a comment\n"
     text += "=" * 80 + "\nMSG: mine/Other\nfloat32 x 1.5\n"
     kind = parse_message_type("mine/msg/Main", text)
-    found = [(f.name, f.length, f.is_array) for f in kind.fields]
-    assert found == [("s", 1, False), ("v", 3, True), ("w", None, True), ("o", 1, False)]
+    fields = [(f.name, f.length, f.is_array) for f in kind.fields]
+    assert fields == [("s", 1, False), ("v", 3, True), ("w", None, True), ("o", 1, False)]
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ def test_the_bytes_are_those_of_the_general_encoder(data):
     values = {"layout": {"dim": dimensions}, "data": np.frombuffer(data, np.uint8)}
     message = fr.frame_message(fr.frames_from_bytes(data))
     assert message == encode(message_type(fr.FRAMES_TYPE), values)
-    at, found = fr.records_at(message)
-    assert (message[at:], found) == (data, count)
+    at, records = fr.records_at(message)
+    assert (message[at:], records) == (data, count)
     decoded = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(message, fr.FRAMES_TYPE)
     assert decoded.data.tobytes() == data
     assert [d.size for d in decoded.layout.dim] == [count, 32]

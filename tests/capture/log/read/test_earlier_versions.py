@@ -36,11 +36,11 @@ def test_each_is_listed_in_the_readme():
 
 
 def test_each_opens_with_every_message_and_no_warning(session_file):
-    names, wanted = positions(session_file)
+    names, expected = positions(session_file)
     with Session.open(session_file) as session:
         signals = session.joints("/joint_states", "position")
         assert list(signals.names) == names
-        for column, values in zip(wanted.T, signals.values, strict=True):
+        for column, values in zip(expected.T, signals.values, strict=True):
             np.testing.assert_array_equal(values, column)
         assert session.metadata["undulog"]["contract"] == "1"
         assert session.robot is not None
@@ -52,8 +52,8 @@ def test_each_opens_with_every_message_and_no_warning(session_file):
 def test_each_is_checked_analysed_and_exported(session_file, command):
     shown = json.loads(command("log", "check", session_file, "--json").out)
     assert shown["verdict"] == "good"
-    found = json.loads(command("analyse", session_file, "--json").out)
-    assert [joint["name"] for joint in found["joints"]] == positions(session_file)[0]
+    report = json.loads(command("analyse", session_file, "--json").out)
+    assert [joint["name"] for joint in report["joints"]] == positions(session_file)[0]
     table = session_file.with_suffix(".csv")
     command("log", "export", session_file, "-o", table)
     assert table.stat().st_size > 1000
@@ -61,8 +61,8 @@ def test_each_is_checked_analysed_and_exported(session_file, command):
 
 @pytest.mark.parametrize("path", TWINS, ids=lambda path: path.stem)
 def test_the_twins_of_all_versions_have_the_same_response_and_servos(path, command):
-    found = json.loads(command("analyse", path, "--json").out)
-    lags = {j["name"]: j["lag_rad"] for j in found["joints"] if j["plane"] == "horizontal"}
+    report = json.loads(command("analyse", path, "--json").out)
+    lags = {j["name"]: j["lag_rad"] for j in report["joints"] if j["plane"] == "horizontal"}
     assert lags == pytest.approx(
         {"joint01": np.radians(85.6), "joint03": np.radians(88.4)}, abs=np.radians(0.2)
     )
@@ -99,13 +99,13 @@ def test_a_killed_recording_is_put_together_and_recovered(tmp_path, command):
     (path,) = tmp_path.glob("*.mcap")
     whole = tmp_path / "whole.mcap"
     assert "none is missing" in command("log", "recover", path, "-o", whole).out
-    names, wanted = positions(whole)
+    names, expected = positions(whole)
     assert names == ["joint01", "joint02", "joint03"]
     with Session.open(path) as session:
         signals = session.joints("/joint_states", "position")
-        for column, values in zip(wanted.T, signals.values, strict=True):
+        for column, values in zip(expected.T, signals.values, strict=True):
             np.testing.assert_array_equal(values, column)
-    assert len(wanted) == 95
+    assert len(expected) == 95
 
 
 @pytest.mark.parametrize(
@@ -116,6 +116,6 @@ def test_a_session_of_a_later_contract_is_read_with_a_warning(tmp_path, version,
     facts = {"contract": version}
     with SessionWriter(path, session_id="a", epoch_ns=0, metadata=facts) as writer:
         writer.joint_state("/joint_states", ["a"], unit="rad")
-    found = [text for text in opened(path).warnings if "of the log contract" in text]
-    assert bool(found) == warns
-    assert all(f"reads up to {CONTRACT_VERSION}:" in text for text in found)
+    warnings = [text for text in opened(path).warnings if "of the log contract" in text]
+    assert bool(warnings) == warns
+    assert all(f"reads up to {CONTRACT_VERSION}:" in text for text in warnings)

@@ -19,41 +19,41 @@ def opened(tmp_path, fill):
 
 
 def test_the_names_of_the_contract_come_first(tmp_path):
-    def fill(own, *tick):
-        own.state(*tick)
-        own.state(*tick, "/joint_commands")
-        own.controller(*tick)
+    def fill(log, *tick):
+        log.state(*tick)
+        log.state(*tick, "/joint_commands")
+        log.controller(*tick)
 
     with opened(tmp_path, fill) as session:
-        found = session.joint_topics()
-        assert (found.command, found.response) == ("/joint_commands", "/joint_states")
-        assert found.notes == ()
+        topics = session.joint_topics()
+        assert (topics.command, topics.response) == ("/joint_commands", "/joint_states")
+        assert topics.notes == ()
         assert session.with_joints() is session
         # By the option, the controller; the responses stay.
-        found = session.joint_topics("/arm/controller_state")
-        assert found.command == "/arm/controller_state.reference"
-        assert found.response == "/joint_states"
+        topics = session.joint_topics("/arm/controller_state")
+        assert topics.command == "/arm/controller_state.reference"
+        assert topics.response == "/joint_states"
 
 
 def test_commands_are_those_of_the_same_joints(tmp_path):
     """A gripper's controller has more messages than that of the arm, and none of its joints."""
 
-    def fill(own, *tick):
-        own.state(*tick)
-        own.controller(*tick, "/arm/controller_state")
+    def fill(log, *tick):
+        log.state(*tick)
+        log.controller(*tick, "/arm/controller_state")
         for step in (0, 1):
-            own.state(tick[0] + step, 0.0, "/gripper/joint_commands", [0.0], ["finger"])
+            log.state(tick[0] + step, 0.0, "/gripper/joint_commands", [0.0], ["finger"])
 
     with opened(tmp_path, fill) as session:
-        found = session.joint_topics()
-        assert found.command == "/arm/controller_state.reference"
-        assert found.response == "/joint_states"
+        topics = session.joint_topics()
+        assert topics.command == "/arm/controller_state.reference"
+        assert topics.response == "/joint_states"
 
 
 def test_states_of_other_joints_give_way_to_those_of_the_controller(tmp_path):
-    def fill(own, *tick):
-        own.controller(*tick)
-        own.state(*tick, positions=[0.0], names=["finger"])
+    def fill(log, *tick):
+        log.controller(*tick)
+        log.state(*tick, positions=[0.0], names=["finger"])
 
     with opened(tmp_path, fill) as session:
         assert session.joint_topics().response == "/arm/controller_state.feedback"
@@ -61,14 +61,14 @@ def test_states_of_other_joints_give_way_to_those_of_the_controller(tmp_path):
 
 
 def test_states_that_could_be_either_are_not_taken(tmp_path):
-    def fill(own, *tick):
-        own.state(*tick, "/left")
-        own.state(*tick, "/right")
+    def fill(log, *tick):
+        log.state(*tick, "/left")
+        log.state(*tick, "/right")
 
     with opened(tmp_path, fill) as session:
-        found = session.joint_topics()
-        assert (found.command, found.response) == ("/joint_commands", "/joint_states")
-        assert found.others == ("/left", "/right")
+        topics = session.joint_topics()
+        assert (topics.command, topics.response) == ("/joint_commands", "/joint_states")
+        assert topics.others == ("/left", "/right")
         with pytest.raises(MissingChannelError, match="choose with --command-topic"):
             session.joint_topics(response="/none")
 
@@ -82,10 +82,10 @@ LACKING = (
 def arrays(kind=ARRAY, width=3, topic="/forward/commands", names=NAMES):
     """States of three joints, and commands without names."""
 
-    def fill(own, t_ns, t_s):
-        own.state(t_ns, t_s, names=names)
+    def fill(log, t_ns, t_s):
+        log.state(t_ns, t_s, names=names)
         data = np.resize(commanded(t_s), width).astype("f4" if "32" in kind else "f8")
-        own.bag.write(topic, t_ns, message(own.bag.store, kind, data=data))
+        log.bag.write(topic, t_ns, message(log.bag.store, kind, data=data))
 
     return fill
 
@@ -93,15 +93,15 @@ def arrays(kind=ARRAY, width=3, topic="/forward/commands", names=NAMES):
 @pytest.mark.parametrize("kind", [ARRAY, "std_msgs/msg/Float32MultiArray"])
 def test_an_array_has_the_joints_of_the_states_if_they_are_as_many(tmp_path, kind):
     with opened(tmp_path, arrays(kind)) as session:
-        found = session.joint_topics()
+        topics = session.joint_topics()
         name = f"/forward/commands:{','.join(NAMES)}"
-        assert (found.command, found.response) == (name, "/joint_states")
-        assert found.notes[1] == (
+        assert (topics.command, topics.response) == (name, "/joint_states")
+        assert topics.notes[1] == (
             "/forward/commands names no joints: those of /joint_states are taken in their order "
             "(others: --command-topic /forward/commands:JOINT,JOINT,...)"
         )
         assert session.joint_topics("/forward/commands").command == name
-        assert found.notes[1] in session.joint_topics("/forward/commands").notes
+        assert topics.notes[1] in session.joint_topics("/forward/commands").notes
         signals = session.with_joints().joints("/joint_commands")
         assert signals.names == NAMES
         expected = [commanded(t_s) for _, t_s in ticks(0.2)]
@@ -118,11 +118,11 @@ def test_an_array_has_the_joints_of_the_robot_before_those_of_the_states(tmp_pat
     robot = tmp_path / "robot.toml"
     assert run(["robot", "new", "-o", str(robot), "--from", str(path)]) == 0
     with Session.open(path, robot=robot) as session:
-        found = session.joint_topics()
+        topics = session.joint_topics()
         joints = session.robot.joint_names
         assert set(joints) == set(NAMES)
-        assert found.command == f"/forward/commands:{','.join(joints)}"
-        assert not [note for note in found.notes if "names no joints" in note]
+        assert topics.command == f"/forward/commands:{','.join(joints)}"
+        assert not [note for note in topics.notes if "names no joints" in note]
 
 
 @pytest.mark.parametrize(
@@ -139,9 +139,9 @@ def test_an_array_has_the_joints_of_the_robot_before_those_of_the_states(tmp_pat
 )
 def test_an_array_whose_joints_are_unknown_is_not_guessed(tmp_path, fill, unnamed):
     with opened(tmp_path, fill) as session:
-        found = session.joint_topics()
-        assert found.command == "/joint_commands"
-        assert len(found.unnamed) == 1 if unnamed is None else found.unnamed == unnamed
+        topics = session.joint_topics()
+        assert topics.command == "/joint_commands"
+        assert len(topics.unnamed) == 1 if unnamed is None else topics.unnamed == unnamed
 
 
 def test_an_array_that_was_chosen_without_its_joints_is_refused_with_the_option(tmp_path):
@@ -161,9 +161,9 @@ def test_the_answer_names_the_array_and_the_option(tmp_path):
 
 
 def test_names_without_joints_are_refused(tmp_path):
-    def fill(own, *tick):
-        own.state(*tick)
-        own.bag.write("/word", tick[0], message(own.bag.store, "std_msgs/msg/String", data="x"))
+    def fill(log, *tick):
+        log.state(*tick)
+        log.bag.write("/word", tick[0], message(log.bag.store, "std_msgs/msg/String", data="x"))
 
     with opened(tmp_path, fill) as session:
         with pytest.raises(DataError, match="/word is std_msgs/msg/String, not of joints"):
@@ -177,10 +177,10 @@ def test_names_without_joints_are_refused(tmp_path):
 
 @given(st.text(max_size=12), st.sampled_from(["", ".", ":", ".a:b", ":a,b", "..", "::"]))
 def test_any_name_is_read_or_refused(text, end):
-    known = {"/a": 0, "/a.b": 0, text: 0}
+    channels = {"/a": 0, "/a.b": 0, text: 0}
     with suppress(DataError):  # names of joints that are empty, or twice there
-        found = joint_source("/a" + text + end, known)
-        assert found is None or found.topic in known
+        source = joint_source("/a" + text + end, channels)
+        assert source is None or source.topic in channels
 
 
 @given(
@@ -197,26 +197,28 @@ def test_a_later_trajectory_replaces_what_is_not_yet_due(drawn):
         JointTrajectory(
             t, 0, ("a",), np.array(after), {"position": np.full((len(after), 1), float(k))}
         )
-        for k, (t, after) in enumerate(sorted(drawn, key=lambda one: one[0]))
+        for k, (t, after) in enumerate(sorted(drawn, key=lambda pair: pair[0]))
     ]
-    (found,), replaced = points_in_force(every, "position", 0)
-    _, t_ns, values = found
-    assert len(t_ns) + replaced == sum(len(one.after_ns) for one in every)
+    (column,), replaced = points_in_force(every, "position", 0)
+    _, t_ns, values = column
+    assert len(t_ns) + replaced == sum(len(trajectory.after_ns) for trajectory in every)
     # Point by point: it is in force if every later trajectory begins after it.
     expected = [
-        (one.log_ns + after, float(k))
-        for k, one in enumerate(every)
-        for after in one.after_ns.tolist()
-        if all(later.log_ns + later.after_ns[0] > one.log_ns + after for later in every[k + 1 :])
+        (trajectory.log_ns + after, float(k))
+        for k, trajectory in enumerate(every)
+        for after in trajectory.after_ns.tolist()
+        if all(
+            later.log_ns + later.after_ns[0] > trajectory.log_ns + after for later in every[k + 1 :]
+        )
     ]
     assert sorted(zip(t_ns.tolist(), values[:, 0].tolist(), strict=True)) == sorted(expected)
 
 
 def test_stamps_of_trajectories_are_on_the_clock_of_the_log(tmp_path):
-    def fill(own, *tick):
-        own.state(*tick)
-        own.trajectory(*tick, "/stamped")
-        own.trajectory(*tick, "/unstamped", stamped=False)
+    def fill(log, *tick):
+        log.state(*tick)
+        log.trajectory(*tick, "/stamped")
+        log.trajectory(*tick, "/unstamped", stamped=False)
 
     with opened(tmp_path, fill) as session:
         for topic in ("/stamped", "/unstamped"):
@@ -225,21 +227,21 @@ def test_stamps_of_trajectories_are_on_the_clock_of_the_log(tmp_path):
         assert len(window.t_ns[0]) == 10
 
 
-def two_snakes(own, *tick):
+def two_snakes(log, *tick):
     """Two robots of the same joints; the commands of b and the states of a have most messages."""
     for space, commands, states in (("/a", 1, 2), ("/b", 2, 1)):
         for step in range(commands):
-            own.state(tick[0] + step, tick[1], f"{space}/joint_commands")
+            log.state(tick[0] + step, tick[1], f"{space}/joint_commands")
         for step in range(states):
-            own.state(tick[0] + step, tick[1], f"{space}/joint_states")
+            log.state(tick[0] + step, tick[1], f"{space}/joint_states")
 
 
 def test_the_commands_of_one_robot_are_never_paired_with_the_states_of_another(tmp_path):
     with opened(tmp_path, two_snakes) as session:
-        found = session.joint_topics()
+        topics = session.joint_topics()
         pairs = {(f"/{x}/joint_commands", f"/{x}/joint_states") for x in "ab"}
-        assert {*found.robots} == pairs
-        assert not found.renamed
+        assert {*topics.robots} == pairs
+        assert not topics.renamed
         for command, response in pairs:
             assert session.joint_topics(command).response == response
             assert session.joint_topics(response=response).command == command

@@ -30,11 +30,11 @@ def write(path, names=NAMES, commanded=NAMES, count=600):
     for k in range(count):
         t_ns, turn = EPOCH_NS + k * 20_000_000, 0.1 * k - 0.6 * np.arange(6)
         states = GAINS * 0.4 * np.sin(turn - 0.2) + 1e-3 * rng.normal(size=6)
-        for topic, own, values in (
+        for topic, joint_names, values in (
             ("/joint_commands", commanded, 0.4 * np.sin(turn)),
             ("/joint_states", names, states),
         ):
-            content = joint_state(t_ns, list(own), position=values.tolist())
+            content = joint_state(t_ns, list(joint_names), position=values.tolist())
             messages.append((topic, t_ns, content))
     write_foreign(path, messages)
     return path
@@ -132,9 +132,9 @@ def test_the_points_of_a_trajectory_keep_both_joints(tmp_path):
 
 
 def test_an_import_keeps_both_joints_and_reports_them(tmp_path):
-    def fill(own, t_ns, t_s):
+    def fill(log, t_ns, t_s):
         for topic in ("/joint_states", "/joint_commands"):
-            own.state(t_ns, t_s, topic, [0.1, 0.2, 0.3], ("a", "b", "b"))
+            log.state(t_ns, t_s, topic, [0.1, 0.2, 0.3], ("a", "b", "b"))
 
     bag = write_bag(tmp_path / "bag", filling(fill, 0.2))
     report = import_bag(bag, tmp_path / "run.mcap")

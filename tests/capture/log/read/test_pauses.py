@@ -47,8 +47,8 @@ SPANS = [(5.0, 6.5), (11.0, 11.2), (17.0, 20.0)]
 
 def test_each_pause_is_found_from_its_first_repeat_to_the_next_new_value():
     commands, positions = gait()
-    found = pauses_s(commands, held(positions, SPANS))
-    assert found == pytest.approx(np.array([(start - 0.01, stop) for start, stop in SPANS]))
+    spans = pauses_s(commands, held(positions, SPANS))
+    assert spans == pytest.approx(np.array([(start - 0.01, stop) for start, stop in SPANS]))
     runs = paused(np.arange(2400) * STEP_NS, held(positions, SPANS).T)
     assert runs.tolist() == [[round(100 * start), round(100 * stop)] for start, stop in SPANS]
 
@@ -57,8 +57,8 @@ def test_samples_of_a_pause_are_left_out_of_all_that_share_their_times():
     commands, positions = gait()
     measured = signals(held(positions, SPANS))
     t_ns = measured["m00"].t_ns
-    rates = {n: Signal(n, "rad/s", t_ns, one.values) for n, one in measured.items()}
-    apart = {n: Signal(n, "A", t_ns + 1, one.values) for n, one in measured.items()}
+    rates = {n: Signal(n, "rad/s", t_ns, signal.values) for n, signal in measured.items()}
+    apart = {n: Signal(n, "A", t_ns + 1, signal.values) for n, signal in measured.items()}
     _, (left, left_rates, left_apart) = without_pauses(signals(commands), measured, rates, apart)
     gone = [k for start, stop in SPANS for k in range(round(100 * start), round(100 * stop))]
     kept = np.setdiff1d(np.arange(2400), gone)
@@ -127,8 +127,10 @@ def test_without_commands_or_with_times_of_their_own_no_pause_is_told():
     commands, positions = gait()
     measured = signals(held(positions, SPANS))
     assert without_pauses({}, measured)[0].size == 0
-    own = {n: Signal(n, "rad", one.t_ns.copy(), one.values) for n, one in measured.items()}
-    assert without_pauses(signals(commands), own)[0].size == 0
+    copies = {
+        n: Signal(n, "rad", signal.t_ns.copy(), signal.values) for n, signal in measured.items()
+    }
+    assert without_pauses(signals(commands), copies)[0].size == 0
     assert without_pauses(signals(commands), {})[1] == [{}]
 
 

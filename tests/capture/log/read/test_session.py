@@ -58,14 +58,14 @@ def test_the_other_channels_read_back_elsewhere(tmp_path):
         ir.write(EPOCH_NS, 0.75)
         writer.imu("/imu", frame="a").write(EPOCH_NS, np.array([0.1, 0.2, 9.8]))
         writer.magnetic_field("/compass", frame="a").write(EPOCH_NS, np.array([2e-5, 0, -4e-5]))
-    found = {topic: content for topic, _, content in decoded_of(path)}
-    assert [t.child_frame_id for t in found["/tf"].transforms] == ["a", "b"]
-    assert abs(found["/tf"].transforms[0].transform.translation.z - 3.00001) <= 2**-15
-    assert found["/tf"].transforms[1].transform.rotation.w == 0.5
-    assert (found["/ir/01"].range, found["/imu"].linear_acceleration.z) == (0.75, 9.8)
-    assert found["/imu"].orientation_covariance[0] == -1.0
-    assert found["/imu"].angular_velocity_covariance[0] == -1.0
-    assert found["/compass"].magnetic_field.z == -4e-5
+    by_topic = {topic: content for topic, _, content in decoded_of(path)}
+    assert [t.child_frame_id for t in by_topic["/tf"].transforms] == ["a", "b"]
+    assert abs(by_topic["/tf"].transforms[0].transform.translation.z - 3.00001) <= 2**-15
+    assert by_topic["/tf"].transforms[1].transform.rotation.w == 0.5
+    assert (by_topic["/ir/01"].range, by_topic["/imu"].linear_acceleration.z) == (0.75, 9.8)
+    assert by_topic["/imu"].orientation_covariance[0] == -1.0
+    assert by_topic["/imu"].angular_velocity_covariance[0] == -1.0
+    assert by_topic["/compass"].magnetic_field.z == -4e-5
 
 
 def test_an_existing_file_stays_unless_forced(tmp_path):

@@ -86,6 +86,6 @@ def test_no_bit_of_a_summary_is_read_wrong(tmp_path):
         data[dice.randrange(start, len(raw) - 8)] ^= 1 << dice.randrange(8)
         path.write_bytes(data)
         assert read_facts("s.mcap", len(raw), lambda start, stop: data[start:stop]).damage  # noqa: B023
-        found, warnings = read(path)
-        assert found == truth
+        messages, warnings = read(path)
+        assert messages == truth
         assert any("read record by record" in text for text in warnings)

@@ -65,14 +65,14 @@ def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path):
         for first in (100, 450, 100, 295, 450, 295):
             start_ns = EPOCH_NS + first * step_ns
             window = {"start_ns": start_ns, "stop_ns": start_ns + 10 * step_ns}
-            found = session.joints("/joint_states", **window)
+            series = session.joints("/joint_states", **window)
             inside = range(first, first + 10)
             truth = {
                 "a": [tick for tick in inside if tick < 300],
                 "b": [-tick if tick < 300 else tick for tick in inside],
                 "c": [-tick for tick in inside if tick >= 300],
             }
-            read = dict(zip(found.names, (v.tolist() for v in found.values), strict=True))
+            read = dict(zip(series.names, (v.tolist() for v in series.values), strict=True))
             assert read == {name: truth[name] for name in truth if truth[name] or name in read}
 
 

@@ -83,9 +83,13 @@ def test_renamed_topics_are_read_by_their_new_names(session):
 
 def test_two_names_of_one_topic_are_both_read(session):
     view = session.view(rename=dict.fromkeys(("/first", "/second"), "/joint_states"))
-    found = view.joint_columns({"/first": ["position"], "/second": ["velocity", "position"]})
-    assert list(found) == [("/first", "position"), ("/second", "velocity"), ("/second", "position")]
-    same_signals(found["/first", "position"], found["/second", "position"])
+    columns = view.joint_columns({"/first": ["position"], "/second": ["velocity", "position"]})
+    assert list(columns) == [
+        ("/first", "position"),
+        ("/second", "velocity"),
+        ("/second", "position"),
+    ]
+    same_signals(columns["/first", "position"], columns["/second", "position"])
 
 
 def test_a_view_reads_through_the_open_file_and_shares_its_warnings(session):

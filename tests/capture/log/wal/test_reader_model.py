@@ -56,36 +56,38 @@ def whole(raw, at, end, last):
 
 def plain(raw, last):
     """Positions in a segment behind a last one, and what is told of its damage."""
-    end, at, found, damaged, first = min(len(raw), END), 64, [], 0, None
+    end, at, positions, damaged, first = min(len(raw), END), 64, [], 0, None
     while True:
         while record := whole(raw, at, end, last):
             at, last = (at + 40 + record[0] + 7) // 8 * 8, record[1]
-            found.append(last)
+            positions.append(last)
         following = next((k for k in range(at, end, 8) if whole(raw, k, end, last)), None)
         stop = at + len(raw[at:end].rstrip(b"\0")) if following is None else following
         first = at if first is None and stop > at else first
         damaged += stop - at
         if following is None:
             text = f"{damaged} bytes are no whole records, the first at byte {first}"
-            return found, [text] * (damaged > 0)
+            return positions, [text] * (damaged > 0)
         at = following
 
 
 def damaged(rng, raw, places):
     """Damage a segment in one of several ways."""
-    one, two = sorted(rng.sample(range(len(places) - 1), 2))
-    at, after = places[one], places[one + 1]
-    other = places[two]
+    first, second = sorted(rng.sample(range(len(places) - 1), 2))
+    at, after = places[first], places[first + 1]
+    other = places[second]
     way = rng.randrange(9)
     if way == 0:  # a bit
         raw[rng.randrange(64, END)] ^= 1 << rng.randrange(8)
     elif way == 1:  # a block that was never written
-        raw[at : places[two + 1]] = bytes(places[two + 1] - at)
+        raw[at : places[second + 1]] = bytes(places[second + 1] - at)
     elif way == 2:  # a record comes twice
         length = min(after - at, END - other)
         raw[other : other + length] = raw[at : at + length]
     elif way == 3:  # a number that was there, or is there later
-        struct.pack_into("<Q", raw, other + 8, rng.choice([one, one + 1, two + 1, two + 9]))
+        struct.pack_into(
+            "<Q", raw, other + 8, rng.choice([first, first + 1, second + 1, second + 9])
+        )
         signed(raw, other)
     elif way == 4:  # another kind or mark
         raw[at + rng.choice([16, 17])] = rng.choice([1, 4, 5, 0xA4, 0xA5, 0xA6])
@@ -113,7 +115,7 @@ def written(folder, segments):
 def test_of_damaged_segments_is_read_what_a_plain_reader_finds(tmp_path, run):
     rng = random.Random(run)
     for _ in range(30):
-        position, segments, found, told = 1, [], [], []
+        position, segments, positions, warnings = 1, [], [], []
         for number in range(1, 4):
             sizes = [rng.choice([0, 1, 8, 60, 300, 1500]) for _ in range(rng.randint(3, 7))]
             records = [(k, 5, rng.randbytes(size)) for k, size in enumerate(sizes, start=position)]
@@ -126,18 +128,18 @@ def test_of_damaged_segments_is_read_what_a_plain_reader_finds(tmp_path, run):
         last = 0
         for number, raw in enumerate(segments, start=1):
             some, texts = plain(raw, last)
-            found += some
-            last = found[-1] if found else 0
+            positions += some
+            last = positions[-1] if positions else 0
             if len(raw) < SIZE:
-                told.append(f"{number:06d}.seg is cut short: {len(raw)} of {SIZE} bytes")
-            told += [f"{number:06d}.seg: {text}" for text in texts]
-        assert [one.position for one in recovery] == found
-        missing = last - found[0] + 1 - len(found) if found else 0
-        counts = len(found), found[0] - 1 if found else 0, missing
+                warnings.append(f"{number:06d}.seg is cut short: {len(raw)} of {SIZE} bytes")
+            warnings += [f"{number:06d}.seg: {text}" for text in texts]
+        assert [message.position for message in recovery] == positions
+        missing = last - positions[0] + 1 - len(positions) if positions else 0
+        counts = len(positions), positions[0] - 1 if positions else 0, missing
         assert (recovery.returned, recovery.before, recovery.missing) == counts
-        told += [f"{missing} messages are missing between those found"] * (missing > 0)
-        told += ["messages of channels that are not defined: 9"] * (len(found) > 0)
-        assert sorted(recovery.warnings) == sorted(told)
+        warnings += [f"{missing} messages are missing between those found"] * (missing > 0)
+        warnings += ["messages of channels that are not defined: 9"] * (len(positions) > 0)
+        assert sorted(recovery.warnings) == sorted(warnings)
 
 
 def test_a_record_without_payload_that_ends_a_segment_is_found_behind_damage(tmp_path):
@@ -145,7 +147,7 @@ def test_a_record_without_payload_that_ends_a_segment_is_found_behind_damage(tmp
     raw, (first, last) = segment_of(records)
     assert last + 40 == END
     raw[first + 4] ^= 1
-    assert [one.position for one in recover(written(tmp_path / "w", [raw]))] == [2]
+    assert [message.position for message in recover(written(tmp_path / "w", [raw]))] == [2]
 
 
 @pytest.mark.parametrize("length", [1 << 20, (1 << 20) + 1, (2 << 20) + 5, (2 << 20) - 1])
@@ -157,7 +159,7 @@ def test_a_payload_of_more_than_a_piece_is_whole_to_its_last_byte(tmp_path, leng
         if at is not None:
             broken[at] ^= 0x80
         recovery = recover(written(tmp_path / "w", [broken]))
-        assert [one.payload for one in recovery] == [payload, b"end"][at is not None :]
+        assert [message.payload for message in recovery] == [payload, b"end"][at is not None :]
         damage = f"000001.seg: {second - first} bytes are no whole records, the first at byte 64"
         assert (damage in recovery.warnings) is (at is not None)
 
@@ -166,7 +168,7 @@ def test_a_payload_of_the_greatest_length_is_read_and_none_beyond(tmp_path, monk
     monkeypatch.setattr(reader, "MAX_PAYLOAD", 500)
     raw, places = segment_of([(1, 5, bytes(499)), (2, 5, bytes(500)), (3, 5, bytes(501))])
     recovery = recover(written(tmp_path / "w", [raw]))
-    assert [one.position for one in recovery] == [1, 2]
+    assert [message.position for message in recovery] == [1, 2]
     assert recovery.warnings[0].endswith(f"the first at byte {places[2]}")
 
 
@@ -212,7 +214,7 @@ def test_damage_is_told_from_where_it_is_also_of_a_segment_that_grows(tmp_path):
     raw[places[9] + 100] ^= 1
     with (folder / "000001.seg").open("r+b") as file:  # the same file, as its recorder has it
         file.write(raw)
-    positions = [one.position for one in (*first, *recovery)]
+    positions = [message.position for message in (*first, *recovery)]
     assert positions == [1, 2, 3, 4, 5, 6, 7, 8, 9, 11]
     damage = f"000001.seg: 1040 bytes are no whole records, the first at byte {places[9]}"
     assert recovery.warnings[0] == damage
@@ -228,7 +230,7 @@ def test_a_record_that_was_read_half_written_is_read_again(tmp_path):
     first = next(recovery)
     with (folder / "000001.seg").open("r+b") as file:
         file.write(raw)
-    assert [first.position, *(one.position for one in recovery)] == [1, 2, 3, 4]
+    assert [first.position, *(message.position for message in recovery)] == [1, 2, 3, 4]
     assert recovery.warnings == ["messages of channels that are not defined: 9"]
 
 

@@ -28,8 +28,8 @@ def made(tmp_path):
         return opened[-1]
 
     yield make
-    for one in opened:
-        one.close(remove=True)
+    for segment in opened:
+        segment.close(remove=True)
 
 
 def ends_of(sizes):

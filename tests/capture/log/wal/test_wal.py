@@ -19,9 +19,9 @@ from undulog.capture.log.wal.writer import WriteAheadLog, wal_folder
 def payloads(folder):
     """The payloads of an undamaged log."""
     recovery = recover(folder)
-    found = [item.payload for item in recovery]
+    contents = [item.payload for item in recovery]
     assert recovery.warnings == []
-    return found
+    return contents
 
 
 # -- what goes in comes out ----------------------------------------------------------------------

@@ -43,7 +43,7 @@ def test_messages_are_one_block_of_mcap_records():
     assert at == len(data)
     assert {key: tail.offsets(block, key).tolist() for key in (1, 2, 3)} == {**places, 3: []}
     assert tail.offsets(block, 3).dtype == np.int64
-    assert [one.tolist() for one in tail.indexed(block, [2, 1])] == [places[2], places[1]]
+    assert [place.tolist() for place in tail.indexed(block, [2, 1])] == [places[2], places[1]]
     room = bytearray(len(data))
     tail.inflate_into(block, memoryview(room))
     assert room == data
@@ -54,8 +54,8 @@ def test_messages_are_one_block_of_mcap_records():
 
 
 def test_what_a_file_lacks_is_told_by_channel_sequence_and_time():
-    known = {(2, 7, 300), (2, 8, 201), (1, 2, 100)}
-    assert beyond(MESSAGES, known) == MESSAGES[1:]
+    in_file = {(2, 7, 300), (2, 8, 201), (1, 2, 100)}
+    assert beyond(MESSAGES, in_file) == MESSAGES[1:]
     assert beyond(MESSAGES, ()) == MESSAGES
 
 
@@ -118,9 +118,9 @@ def test_a_log_under_way_is_live(tmp_path):
         wal.define(CHANNEL)
         for position in range(1, 4):
             assert wal.append(*message(position)) == position == wal.position
-        found = read_wal(tmp_path / "x.mcap")
-        assert (found.live, found.accepted) == (True, 3)
-        assert found.warnings == ("messages of channels that are not defined: 2, 3",)
+        recovered = read_wal(tmp_path / "x.mcap")
+        assert (recovered.live, recovered.accepted) == (True, 3)
+        assert recovered.warnings == ("messages of channels that are not defined: 2, 3",)
         assert wal.place == wal.folder
 
 
@@ -150,12 +150,12 @@ def test_messages_of_one_size_are_accepted_together_or_not_at_all(tmp_path, coun
         assert not wal.append_all(same)  # 27 or 30 records of 152 bytes are more than a segment
         assert wal.position == 2 * count
         assert wal.append(*same[0]) == 2 * count + 1
-    found = list(recover(folder))
+    messages = list(recover(folder))
     expected = [*same, *same, same[0]]
     assert [
-        (m.channel_id, m.log_time_ns, m.publish_time_ns, m.sequence, m.payload) for m in found
+        (m.channel_id, m.log_time_ns, m.publish_time_ns, m.sequence, m.payload) for m in messages
     ] == expected
-    assert [one.position for one in found] == list(range(1, 2 * count + 2))
+    assert [message.position for message in messages] == list(range(1, 2 * count + 2))
 
 
 # -- layout ---------------------------------------------------------------------------------------
@@ -185,8 +185,10 @@ def test_segments_have_their_names_and_come_in_order(tmp_path):
     assert (layout.MESSAGES, layout.DEFINITIONS, layout.MARK) == (0, 1, 0xA5)
     for name in ("000010.seg", "000009.seg", "def-000001.seg", "x.seg", "00001.seg", "000001.segx"):
         (tmp_path / name).touch()
-    found = [(stream, number, path.name) for stream, number, path in layout.segment_files(tmp_path)]
-    assert found == [(0, 9, "000009.seg"), (0, 10, "000010.seg"), (1, 1, "def-000001.seg")]
+    segments = [
+        (stream, number, path.name) for stream, number, path in layout.segment_files(tmp_path)
+    ]
+    assert segments == [(0, 9, "000009.seg"), (0, 10, "000010.seg"), (1, 1, "def-000001.seg")]
 
 
 def test_definitions_are_the_bodies_of_their_mcap_records():
@@ -212,8 +214,8 @@ def test_damage_is_counted_from_where_it_begins_to_the_next_whole_record(tmp_pat
             raw[places[11] + 30] ^= 1
         segment.write_bytes(raw)
         recovery = recover(folder)
-        found = [one.position for one in recovery]
-        assert found == [k for k in range(1, 13) if k - 1 != broken and not (last and k == 12)]
+        positions = [message.position for message in recovery]
+        assert positions == [k for k in range(1, 13) if k - 1 != broken and not (last and k == 12)]
         lost = places[broken + 1] - places[broken]
         if last:
             lost += len(bytes(raw[places[11] : -64]).rstrip(b"\0"))

@@ -224,13 +224,13 @@ def test_whatever_bytes_there_are_only_true_messages_come_out(tmp_path, quick_fo
         hit = damage(rng, folder)
         try:
             recovery = recover(folder)
-            found = list(recovery)
+            messages = list(recovery)
         except LogError:
             outcomes["none"] += 1
             continue
-        positions = check_messages(found)
-        assert recovery.returned == len(found)
-        if found:
+        positions = check_messages(messages)
+        assert recovery.returned == len(messages)
+        if messages:
             gaps = sum(b - a - 1 for a, b in itertools.pairwise(positions))
             assert (recovery.before, recovery.missing) == (positions[0] - 1, gaps)
         whole = positions == list(range(1, 41))

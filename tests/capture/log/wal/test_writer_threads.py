@@ -153,10 +153,10 @@ def test_what_a_log_starts_with(tmp_path):
     with WriteAheadLog(tmp_path / "w") as wal:
         assert (wal.position, wal.synced, wal.shortage) == (0, 0, None)
         names = {f"sync {wal.folder}", f"hold {wal.folder}"}
-        running = {one.name: one.daemon for one in threading.enumerate()}
+        running = {thread.name: thread.daemon for thread in threading.enumerate()}
         assert [running[name] for name in names] == [True, True]
         wal.release(0)
-    assert names.isdisjoint(one.name for one in threading.enumerate())
+    assert names.isdisjoint(thread.name for thread in threading.enumerate())
 
 
 # -- segments --------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def test_segments_are_removed_as_soon_as_their_last_message_is_released(tmp_path
         wait_for(lambda: names(wal.folder) == kept, "the release")
         wal.release(position - 1)  # one that was released already changes nothing
         assert names(wal.folder) == kept
-    assert [one.position for one in recover(tmp_path / "w")] == [*range(position + 1, 5)]
+    assert [message.position for message in recover(tmp_path / "w")] == [*range(position + 1, 5)]
 
 
 def test_a_message_that_is_refused_after_a_full_segment_leaves_what_is_synced(tmp_path):
@@ -215,4 +215,4 @@ def test_the_longest_message_is_accepted_and_none_beyond(tmp_path, monkeypatch):
             wal.append(1, 0, 0, 0, bytes(10_001))
         with pytest.raises(DataError, match="at most 10000 are kept"):
             wal.define(CHANNEL.__class__(2, "/" + "x" * 10_000, "cdr", {}, 0))
-    assert [len(one.payload) for one in recover(tmp_path / "w")] == [10_000]
+    assert [len(message.payload) for message in recover(tmp_path / "w")] == [10_000]

@@ -53,7 +53,7 @@ def test_joint_states(tmp_path):
     assert raw == TIMES
     assert stamp_ns(first.header) == stamp_ns(second.header) == EPOCH_NS
     assert first.name == ["a", "b"]
-    assert [list(one) for one in (first.position, first.velocity, first.effort)] == [
+    assert [list(values) for values in (first.position, first.velocity, first.effort)] == [
         [1.0, 2.0], [3.0, 4.0], [5.0, 6.0],
     ]  # fmt: skip
     assert np.isnan(second.position[0])
@@ -77,32 +77,32 @@ def test_joints_without_velocity_and_effort_and_some_of_them(tmp_path):
 
 def test_odometry(tmp_path):
     position, linear, angular = np.arange(3.0), np.arange(3.0) + 10, np.arange(3.0) + 20
-    raw, (found, _) = written(
+    raw, (message, _) = written(
         tmp_path / "x.mcap",
         lambda writer: writer.odometry("/odom", frame="world", child="head"),
         ((position, QUATERNION, linear, angular), {}),
         ((position, QUATERNION, linear, angular), LOGGED),
     )
     assert raw == TIMES
-    assert (found.header.frame_id, found.child_frame_id) == ("world", "head")
-    assert stamp_ns(found.header) == EPOCH_NS
-    assert row(found.pose.pose.position) == position.tolist()
-    assert row(found.pose.pose.orientation, "xyzw") == QUATERNION.tolist()
-    assert row(found.twist.twist.linear) == linear.tolist()
-    assert row(found.twist.twist.angular) == angular.tolist()
+    assert (message.header.frame_id, message.child_frame_id) == ("world", "head")
+    assert stamp_ns(message.header) == EPOCH_NS
+    assert row(message.pose.pose.position) == position.tolist()
+    assert row(message.pose.pose.orientation, "xyzw") == QUATERNION.tolist()
+    assert row(message.twist.twist.linear) == linear.tolist()
+    assert row(message.twist.twist.angular) == angular.tolist()
 
 
 def test_transforms_are_rounded_for_viewers(tmp_path):
     positions = np.array([[0.1, 0.2, 0.3], [1.0, -2.0, 3.0]])
     turns = np.array([QUATERNION, [0.0, 0.0, 0.0, 1.0]])
-    raw, (found, _) = written(
+    raw, (message, _) = written(
         tmp_path / "x.mcap",
         lambda writer: writer.transforms("/tf", parent="world", children=["a", "b"]),
         ((positions, turns), {}),
         ((positions, turns), LOGGED),
     )
     assert raw == TIMES
-    for k, transform in enumerate(found.transforms):
+    for k, transform in enumerate(message.transforms):
         assert stamp_ns(transform.header) == EPOCH_NS
         assert (transform.header.frame_id, transform.child_frame_id) == ("world", "ab"[k])
         got = [*row(transform.transform.translation), *row(transform.transform.rotation, "xyzw")]
@@ -129,8 +129,8 @@ def test_ranges(infrared, tmp_path):
         writer.range("/r", frame="f", min_range=0.5, max_range=1.5, field_of_view=0.25).write(
             EPOCH_NS, 1.0
         )
-    ((_, _, found),) = decoded_of(tmp_path / "y.mcap")
-    assert (found.field_of_view, found.radiation_type) == (0.25, 1)  # infrared by default
+    ((_, _, message),) = decoded_of(tmp_path / "y.mcap")
+    assert (message.field_of_view, message.radiation_type) == (0.25, 1)  # infrared by default
 
 
 def test_an_accelerometer_says_that_it_has_no_gyroscope(tmp_path):
@@ -162,13 +162,13 @@ def test_many_of_an_accelerometer_after_one_with_a_gyroscope(tmp_path):
 
 
 def test_magnetic_fields(tmp_path):
-    _, (found,) = written(
+    _, (message,) = written(
         tmp_path / "x.mcap",
         lambda writer: writer.magnetic_field("/compass", frame="c"),
         ((np.array([1e-5, -2e-5, 3e-5]),), {}),
     )
-    assert row(found.magnetic_field) == [1e-5, -2e-5, 3e-5]
-    assert found.header.frame_id == "c"
+    assert row(message.magnetic_field) == [1e-5, -2e-5, 3e-5]
+    assert message.header.frame_id == "c"
 
 
 def test_a_devices_clock_against_the_hosts(tmp_path):
@@ -200,7 +200,7 @@ def test_texts_and_events(tmp_path):
         content for *_, content in decoded_of(path)
     )  # the text was recorded later
     assert mode.data == "wälk"
-    assert [one.level for one in events_read] == [10, 20, 30, 40, 50]  # rcl_interfaces/msg/Log
+    assert [event.level for event in events_read] == [10, 20, 30, 40, 50]  # rcl_interfaces/msg/Log
     third = events_read[2]
     assert (third.name, third.msg, third.stamp.nanosec) == ("twin", "warnwarn", 123_456_789)
     *_, (*_, last) = messages_of(path)
@@ -212,13 +212,15 @@ def test_diagnostics(tmp_path):
         DiagnosticStatus(0, "source a", "fine"),
         DiagnosticStatus(2, "disk", "full", "/dev/x", {"free": "0", "left": "3"}),
     ]
-    _, (found,) = written(
+    _, (message,) = written(
         tmp_path / "x.mcap", lambda writer: writer.diagnostics(), ((statuses,), {})
     )
-    assert stamp_ns(found.header) == EPOCH_NS
-    listed = [(one.level, one.name, one.message, one.hardware_id) for one in found.status]
+    assert stamp_ns(message.header) == EPOCH_NS
+    listed = [
+        (status.level, status.name, status.message, status.hardware_id) for status in message.status
+    ]
     assert listed == [(0, "source a", "fine", ""), (2, "disk", "full", "/dev/x")]
-    assert [(value.key, value.value) for value in found.status[1].values] == [
+    assert [(value.key, value.value) for value in message.status[1].values] == [
         ("free", "0"),
         ("left", "3"),
     ]
@@ -235,10 +237,10 @@ def test_frames_of_a_bus(fd, tmp_path):
         channel.write(EPOCH_NS, frames)
         with pytest.raises(DataError, match="frames have the layout"):
             channel.write(EPOCH_NS, (empty_frames if fd else empty_fd_frames)(1))
-    ((_, at_ns, found),) = decoded_of(path)
+    ((_, at_ns, message),) = decoded_of(path)
     assert at_ns == EPOCH_NS
-    assert [one.size for one in found.layout.dim] == [3, frames.dtype.itemsize]
-    assert bytes(found.data) == frames.tobytes()
+    assert [dimension.size for dimension in message.layout.dim] == [3, frames.dtype.itemsize]
+    assert bytes(message.data) == frames.tobytes()
 
 
 # -- the session around them ----------------------------------------------------------------------
@@ -257,15 +259,15 @@ def test_channels_have_units_and_a_topic_has_one(tmp_path):
             writer.string("/s")
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    found = {channel.topic: channel for channel in summary.channels.values()}
-    assert {topic: one.metadata for topic, one in found.items()} == {
+    channels = {channel.topic: channel for channel in summary.channels.values()}
+    assert {topic: channel.metadata for topic, channel in channels.items()} == {
         "/j": {"unit": "deg"}, "/r": {"unit": "m"}, "/m": {"unit": "T"}, "/raw": {"k": "v"},
         "/s": {},
     }  # fmt: skip
-    assert {one.message_encoding for one in found.values()} == {"cdr"}
-    assert found["/raw"].schema_id == found["/s"].schema_id  # a type has one schema
+    assert {channel.message_encoding for channel in channels.values()} == {"cdr"}
+    assert channels["/raw"].schema_id == channels["/s"].schema_id  # a type has one schema
     names = {key: schema.name for key, schema in summary.schemas.items()}
-    assert names[found["/r"].schema_id] == "sensor_msgs/msg/Range"
+    assert names[channels["/r"].schema_id] == "sensor_msgs/msg/Range"
     assert len(set(names.values())) == len(names)
 
 
@@ -276,12 +278,12 @@ def test_a_session_explains_itself(tmp_path):
         writer.note_at_end("late", {"a": "1"})
         writer.note_at_end("late", {"a": "2"})
         writer.set_verdict("degraded", ["one", "two"])
-    found = metadata_of(path)
-    facts = found["undulog"]
+    records = metadata_of(path)
+    facts = records["undulog"]
     assert (facts["session_id"], facts["epoch_ns"]) == ("s", str(EPOCH_NS))
     assert (facts["robot"], facts["clock.can0"], facts["operator"]) == ("snake25", "device", "ü")
-    assert found["late"] == {"a": "2"}
-    assert found["undulog.health"]["verdict"] == "degraded"
+    assert records["late"] == {"a": "2"}
+    assert records["undulog.health"]["verdict"] == "degraded"
     with path.open("rb") as stream:
         attached = {
             attachment.name: attachment for attachment in make_reader(stream).iter_attachments()
@@ -289,7 +291,7 @@ def test_a_session_explains_itself(tmp_path):
     assert attached["robot.toml"].data == robot.toml.encode()
     assert attached["robot.toml"].media_type == "application/toml"
     assert attached["snake25.dbc"].data == dict(robot.databases)["snake25.dbc"].encode()
-    assert {one.create_time for one in attached.values()} == {EPOCH_NS}
+    assert {attachment.create_time for attachment in attached.values()} == {EPOCH_NS}
 
 
 def test_a_closed_session_takes_nothing(tmp_path):
@@ -314,5 +316,5 @@ def test_rows_go_on_counting(tmp_path):
         times = EPOCH_NS + np.arange(2)
         channel.write_rows(times, np.zeros((2, 1)), none, none, log_time_ns=times + 3)
         channel.write(EPOCH_NS + 9, [1.0])
-    found = [(m.sequence, m.log_time - EPOCH_NS) for *_, m in messages_of(path)]
-    assert found == [(0, 0), (1, 3), (2, 4), (3, 9)]
+    numbers = [(m.sequence, m.log_time - EPOCH_NS) for *_, m in messages_of(path)]
+    assert numbers == [(0, 0), (1, 3), (2, 4), (3, 9)]

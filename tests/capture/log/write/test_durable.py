@@ -278,8 +278,8 @@ def test_a_full_disk_ends_in_a_file_with_all_that_was_accepted(small_disk, split
 @pytest.mark.slow
 def test_a_disk_too_full_to_finalise_keeps_all_in_the_write_ahead_log(small_disk):
     accepted, end = fill(small_disk, 0, hog="late")
-    found, warnings = read(small_disk / "run.mcap")
-    assert found == recorder.truth(accepted)
+    messages, warnings = read(small_disk / "run.mcap")
+    assert messages == recorder.truth(accepted)
     if end != "finalised":  # as it is when the segments went before the disk was filled
         assert f"all {accepted} messages are kept" in end
         assert f"undulog log recover {small_disk / 'run.mcap'}" in end
@@ -316,8 +316,8 @@ def test_a_failing_disk_ends_the_recording_and_loses_nothing(tmp_path, monkeypat
         sink.close(())
     monkeypatch.undo()
     assert not (tmp_path / "run.mcap.wal" / "ballast").exists()
-    found, warnings = read(path)
-    assert found == recorder.truth(len(accepted))
+    messages, warnings = read(path)
+    assert messages == recorder.truth(len(accepted))
     assert any("none is missing" in text for text in warnings)
 
 

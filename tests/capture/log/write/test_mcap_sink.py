@@ -49,8 +49,8 @@ def test_chunks_are_compressed_at_level_3(tmp_path):
 
 def test_messages_and_definitions_come_back_with_their_numbers(tmp_path):
     path = written(tmp_path / "run.mcap")
-    found = [(c.topic, m.log_time, m.publish_time, m.sequence) for _, c, m in messages_of(path)]
-    assert found == [("/a", 1000 + k, 900 + k, 5 + k) for k in range(300)]
+    messages = [(c.topic, m.log_time, m.publish_time, m.sequence) for _, c, m in messages_of(path)]
+    assert messages == [("/a", 1000 + k, 900 + k, 5 + k) for k in range(300)]
     assert metadata_of(path)["end"] == {"a": "1"}
     with path.open("rb") as stream:
         header = make_reader(stream).get_header()
@@ -71,9 +71,9 @@ def test_a_definition_with_another_number_than_the_next_is_refused(tmp_path):
     sink.define(Attachment(3, 4, "a.toml", "application/toml", b"data"))
     sink.close(())
     with (tmp_path / "run.mcap").open("rb") as stream:
-        (found,) = make_reader(stream).iter_attachments()
-    assert (found.log_time, found.create_time, found.name) == (4, 3, "a.toml")
-    assert (found.media_type, found.data) == ("application/toml", b"data")
+        (attachment,) = make_reader(stream).iter_attachments()
+    assert (attachment.log_time, attachment.create_time, attachment.name) == (4, 3, "a.toml")
+    assert (attachment.media_type, attachment.data) == ("application/toml", b"data")
 
 
 def test_topics_that_carry_most_have_chunks_of_their_own():

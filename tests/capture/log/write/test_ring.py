@@ -45,8 +45,8 @@ def written(ring):
 def read(path):
     """All messages of a file by a foreign reader: channel by channel, as each was written."""
     rows = messages_of(path, log_time_order=False)
-    found = [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in rows]
-    return by_channel(found)
+    messages = [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in rows]
+    return by_channel(messages)
 
 
 def by_channel(messages):
@@ -90,17 +90,17 @@ STEP = st.tuples(st.integers(1, 2), st.integers(0, 400), st.binary(max_size=40))
 def test_a_mark_has_the_last_seconds_bit_for_bit(tmp_path_factory, steps, window_ms, marks):
     folder = tmp_path_factory.mktemp("ring")
     ring = defined(RingSink(folder / "run.mcap", window_ms * MS))
-    sent, wanted, t_ns = [], {}, EPOCH_NS
+    sent, expected, t_ns = [], {}, EPOCH_NS
     for k, (channel, step_ms, payload) in enumerate(steps):
         t_ns += step_ms * MS
         sent.append((channel, t_ns, t_ns - k, k, payload))
         ring.write(*sent[-1])
         if k in marks:
-            wanted[ring.mark()] = [m for m in sent if m[1] >= t_ns - window_ms * MS]
+            expected[ring.mark()] = [m for m in sent if m[1] >= t_ns - window_ms * MS]
     ring.close(())
-    assert [mark.path for mark in ring.marks] == list(wanted)
+    assert [mark.path for mark in ring.marks] == list(expected)
     for mark in ring.marks:
-        truth = wanted[mark.path]
+        truth = expected[mark.path]
         assert (mark.error, mark.messages) == (None, len(truth))
         assert read(mark.path) == by_channel(truth)
         assert (mark.start_ns, mark.stop_ns) == (truth[0][1], truth[-1][1])
@@ -158,9 +158,9 @@ def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
             assert session.metadata["undulog"]["place"] == "x"
             assert session.attachments["scenario.toml"] == b"a = 1"
             assert session.warnings == []
-            wanted = np.arange(last - 200, last + 1.0)
+            expected = np.arange(last - 200, last + 1.0)
             states = session.joints("/joint_states").values
-            np.testing.assert_array_equal(states, [wanted, -wanted])
+            np.testing.assert_array_equal(states, [expected, -expected])
             assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
     with Session(path) as session:
         assert [m.msg for _, m in session.messages("/rosout")] == ["late channel"]
@@ -400,11 +400,11 @@ def test_a_mark_that_a_kill_interrupts_has_no_final_name_and_is_recovered(tmp_pa
     assert f"is the name of a ring, which has only marks; name one: {name}" in ring
     shutil.copy(tmp_path / name, tmp_path / "other_mark0001.mcap.part")
     table = command("log", "info", tmp_path).out
-    for each in (name, "other_mark0001.mcap.part"):
-        assert f"{each} has not got its final name" in table
+    for part in (name, "other_mark0001.mcap.part"):
+        assert f"{part} has not got its final name" in table
     command("log", "recover", tmp_path / "run_mark0001.mcap")
-    found = messages_of(tmp_path / "run_mark0001.recovered.mcap")
-    assert [message.sequence for *_, message in found] == list(range(len(found)))
-    assert 1000 < len(found) <= 3500  # the chunks that were whole
+    messages = messages_of(tmp_path / "run_mark0001.recovered.mcap")
+    assert [message.sequence for *_, message in messages] == list(range(len(messages)))
+    assert 1000 < len(messages) <= 3500  # the chunks that were whole
     ring = RingSink(tmp_path / "run.mcap", SECOND)  # numbers go on after it
     assert marked(ring).name == "run_mark0002.mcap"

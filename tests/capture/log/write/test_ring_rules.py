@@ -74,29 +74,29 @@ def test_a_ring_holds_what_a_plain_list_does(tmp_path, seed):
     model = Model(rng.choice([5, 50]) * NS, 40 * (MESSAGE_OVERHEAD + 20))
     ring = RingSink(tmp_path / "run.mcap", model.duration_ns, max_bytes=model.max_bytes)
     defined(ring)
-    now_ns, wanted = EPOCH_NS, {}
+    now_ns, marked = EPOCH_NS, {}
     for number in range(600):
         now_ns += rng.choice([0, 1, NS // 10, NS, -NS, 3 * NS]) if rng.random() < 0.5 else 0
         size = rng.choice([0, 1, 20, 40, 3000]) if rng.random() < 0.9 else 20_000
         channel = rng.choice([1, 2, LATCHED, STATIC])
         payload = bytes([rng.randrange(3)]) * size
-        for one in (ring, model):
-            one.write(channel, now_ns, now_ns - number, number, payload)
-        found = (ring.messages, ring.size, ring.accepted, ring.dropped, ring.span_ns)
+        for target in (ring, model):
+            target.write(channel, now_ns, now_ns - number, number, payload)
+        state = (ring.messages, ring.size, ring.accepted, ring.dropped, ring.span_ns)
         span_ns = model.newest_ns - model.held[0][1]
-        assert found == (len(model.held), model.size, number + 1, model.dropped, span_ns)
+        assert state == (len(model.held), model.size, number + 1, model.dropped, span_ns)
         if number % 199 == 150:
-            wanted[ring.mark(f"{number}")] = (model.mark(), model.newest_ns, model.dropped)
+            marked[ring.mark(f"{number}")] = (model.mark(), model.newest_ns, model.dropped)
     ring.close(())
-    assert len(wanted) == 3
-    for path, (messages, newest_ns, dropped) in wanted.items():
+    assert len(marked) == 3
+    for path, (messages, newest_ns, dropped) in marked.items():
         read = [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in
                 messages_of(path, log_time_order=False)]  # fmt: skip
         assert sorted(read) == sorted(messages)
         facts = metadata_of(path)[MARK_RECORD]
         assert (facts["stop_ns"], facts["dropped"]) == (str(newest_ns), str(dropped))
         assert facts["ring_s"] == repr(model.duration_ns / 1e9)
-    for mark, (messages, *_) in zip(ring.marks, wanted.values(), strict=True):
+    for mark, (messages, *_) in zip(ring.marks, marked.values(), strict=True):
         held = [t_ns for _, t_ns, *_ in messages]
         assert (mark.messages, mark.error) == (len(messages), None)
         assert (mark.start_ns, mark.stop_ns) == (min(held), max(held))
@@ -202,7 +202,7 @@ def storage(tmp_path):
     storage.sink.close(())
 
 
-def told(storage):
+def texts_of(storage):
     wait_for(lambda: not storage.sink.waiting, "the marks")
     return storage.tick()
 
@@ -217,7 +217,7 @@ def test_a_storage_tells_of_each_mark_once_and_adds_their_sizes(storage):
         reply = storage.mark("slipped")
         path = storage.part_path.with_name(f"run_mark000{number}.mcap")
         assert reply == {"file": str(path), "messages": 10 * number, "seconds": 1.111}
-        ((level, text),) = told(storage)
+        ((level, text),) = texts_of(storage)
         size += path.stat().st_size
         assert (level, storage.size, storage.tick()) == ("info", size, [])
         assert text.startswith(f"{path.name} is written: {10 * number} messages, ")
@@ -246,7 +246,7 @@ def test_a_mark_that_was_moved_away_counts_nothing_and_a_failed_one_is_told(stor
     storage.sink._open_file = lambda _: (_ for _ in ()).throw(DataError("odd"))
     third = storage.part_path.with_name("run_mark0003.mcap")
     storage.mark("")
-    assert told(storage) == [("error", f"a mark is not whole: {third}: odd")]
+    assert texts_of(storage) == [("error", f"a mark is not whole: {third}: odd")]
     assert (storage.size, storage.files()) == (0, (path,))
 
 
@@ -254,5 +254,7 @@ def test_a_ring_that_is_full_of_bytes_is_told_once(storage):
     storage.sink._max_bytes = 3 * (MESSAGE_OVERHEAD + 1)
     for number in range(9):
         storage.sink.write(1, EPOCH_NS + number * NS // 4, EPOCH_NS, number, b"x")
-        wanted = [("warn", "the ring is full of bytes and holds only 0.5 s")] if number == 3 else []
-        assert storage.tick() == wanted
+        expected = (
+            [("warn", "the ring is full of bytes and holds only 0.5 s")] if number == 3 else []
+        )
+        assert storage.tick() == expected

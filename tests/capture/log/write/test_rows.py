@@ -32,8 +32,8 @@ def session(path, names, times, fields, *, at_once, sink=None):
         else:
             for row in zip(times.tolist(), *fields, strict=True):
                 channel.write(*row)
-    found = [message for *_, message in messages_of(path, log_time_order=False)]
-    return [(m.log_time, m.publish_time, m.sequence, m.data) for m in found]
+    messages = [message for *_, message in messages_of(path, log_time_order=False)]
+    return [(m.log_time, m.publish_time, m.sequence, m.data) for m in messages]
 
 
 @st.composite
@@ -50,9 +50,9 @@ def samples(draw):
 @given(case=samples())
 def test_the_same_messages(case, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rows")
-    one, many = (session(folder / f"{k}.mcap", *case, at_once=k) for k in (False, True))
-    assert many == one
-    assert len(one) == len(case[1])
+    single, many = (session(folder / f"{k}.mcap", *case, at_once=k) for k in (False, True))
+    assert many == single
+    assert len(single) == len(case[1])
 
 
 @pytest.fixture(scope="module")
@@ -66,21 +66,21 @@ def long_run():
 
 
 def test_over_several_chunks(tmp_path, long_run):
-    one, many = (session(tmp_path / f"{k}.mcap", *long_run, at_once=k) for k in (False, True))
-    assert many == one
+    single, many = (session(tmp_path / f"{k}.mcap", *long_run, at_once=k) for k in (False, True))
+    assert many == single
     assert (tmp_path / "True.mcap").read_bytes() == (tmp_path / "False.mcap").read_bytes()
 
 
 def test_a_foreign_decoder_reads_the_values(tmp_path, long_run):
     names, times, fields = long_run
     session(tmp_path / "x.mcap", *long_run, at_once=True)
-    found = [(t_ns, message) for _, t_ns, message in decoded_of(tmp_path / "x.mcap")]
-    assert [t_ns for t_ns, _ in found] == times.tolist()
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in found]
+    messages = [(t_ns, message) for _, t_ns, message in decoded_of(tmp_path / "x.mcap")]
+    assert [t_ns for t_ns, _ in messages] == times.tolist()
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in messages]
     assert stamps == times.tolist()
     for name, field in zip(("position", "velocity", "effort"), fields, strict=True):
-        assert np.array_equal([getattr(m, name) for _, m in found], field, equal_nan=True)
-    assert found[-1][1].name == names
+        assert np.array_equal([getattr(m, name) for _, m in messages], field, equal_nan=True)
+    assert messages[-1][1].name == names
 
 
 @pytest.mark.parametrize("segment_size", [1 << 14, 1 << 20])
@@ -96,16 +96,16 @@ def test_through_the_write_ahead_log(tmp_path, long_run, segment_size):
 def test_parts_of_a_split_session(tmp_path, long_run):
     names, times, fields = long_run
     some = names, times[:400], [field[:400] for field in fields]
-    found = []
+    runs = []
     for at_once in (False, True):
         path = tmp_path / str(at_once) / "run.mcap"
         path.parent.mkdir()
         sink = DurableSink(path, split_ns=10**9, ballast=0)  # some boundaries are within a batch
         session(path, *some, at_once=at_once, sink=sink)
         parts = sorted(path.parent.glob("*.mcap"))
-        found.append([[m.data for *_, m in messages_of(part)] for part in parts])
-    assert found[0] == found[1]
-    assert len(found[0]) == 4
+        runs.append([[m.data for *_, m in messages_of(part)] for part in parts])
+    assert runs[0] == runs[1]
+    assert len(runs[0]) == 4
 
 
 @settings(max_examples=60, deadline=None)
@@ -115,7 +115,7 @@ def test_parts_of_a_split_session(tmp_path, long_run):
 )
 def test_the_write_ahead_log_is_that_of_single_messages(sizes, segment_size, tmp_path_factory):
     folder = tmp_path_factory.mktemp("wal")
-    found = []
+    logs = []
     for at_once in (False, True):
         with WriteAheadLog(folder / str(at_once), segment_size=segment_size) as wal:
             for k, (size, count) in enumerate(sizes):
@@ -124,10 +124,10 @@ def test_the_write_ahead_log_is_that_of_single_messages(sizes, segment_size, tmp
                     for message in messages:
                         wal.append(*message)
         recovery = recover(folder / str(at_once))
-        found.append([message[:] for message in recovery])
+        logs.append([message[:] for message in recovery])
         assert (recovery.missing, recovery.before) == (0, 0)
-    assert found[0] == found[1]
-    assert len(found[0]) == sum(count for _, count in sizes)
+    assert logs[0] == logs[1]
+    assert len(logs[0]) == sum(count for _, count in sizes)
 
 
 @pytest.mark.parametrize("kind", list(SensorKind))
@@ -136,7 +136,7 @@ def test_sensors_many_at_once_as_one_by_one(tmp_path, kind):
     values[3] = np.nan
     times, logged = EPOCH_NS + np.arange(20) * 7, EPOCH_NS + np.arange(20) * 7 + 5
     sensor = Sensor("one", kind, "head", (0.0, 0.0, 0.0), range_min=0.1, range_max=4.0)
-    found = []
+    files = []
     for at_once in (False, True):
         path = tmp_path / f"{at_once}.mcap"
         with SessionWriter(path, **FACTS) as writer:
@@ -146,9 +146,9 @@ def test_sensors_many_at_once_as_one_by_one(tmp_path, kind):
             else:
                 for t_ns, row, log_ns in zip(times.tolist(), values, logged.tolist(), strict=True):
                     channel.write(t_ns, row, log_time_ns=log_ns)
-        found.append([(m.log_time, m.publish_time, m.data) for *_, m in messages_of(path)])
-    assert found[0] == found[1]
-    assert len(found[0]) == 20
+        files.append([(m.log_time, m.publish_time, m.data) for *_, m in messages_of(path)])
+    assert files[0] == files[1]
+    assert len(files[0]) == 20
 
 
 def test_a_wrong_shape_is_refused(tmp_path):

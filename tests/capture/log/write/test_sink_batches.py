@@ -72,8 +72,8 @@ def test_a_batch_is_as_its_messages_one_by_one(sink_of, now, options):
         assert first == second
         if number % 6 == 5:
             now[0] += rng.choice([1.0, 2.0, 5.0])
-            for one in sinks:
-                one.tick()
+            for writer in sinks:
+                writer.tick()
     names = []
     for sink in sinks:
         sink.close((Metadata("end", {}),))

@@ -54,17 +54,17 @@ lose_power()
 """
     disk.run(program, disk.root / "run.mcap", syncs)
     for loss in Loss:
-        found = disk.after(loss) / "run.mcap.part"
-        assert found.read_bytes()[: 256 * syncs] == bytes(range(256)) * syncs, loss
+        part = disk.after(loss) / "run.mcap.part"
+        assert part.read_bytes()[: 256 * syncs] == bytes(range(256)) * syncs, loss
 
 
 def test_a_file_that_was_published_has_its_name(disk):
     program = "part = stream(); part.put(memoryview(b'12')); part.sync(); part.publish()"
     disk.run(program, disk.root / "run.mcap", code=0)
     for loss in Loss:
-        found = disk.after(loss)
-        assert names(found) == ["run.mcap"]
-        assert (found / "run.mcap").read_bytes() == b"12"
+        left = disk.after(loss)
+        assert names(left) == ["run.mcap"]
+        assert (left / "run.mcap").read_bytes() == b"12"
 
 
 @pytest.mark.parametrize("then", ["publish", "sync"])
@@ -80,9 +80,9 @@ lose_power()
 """
     disk.run(program, disk.root / "run.mcap", then)
     for loss in Loss:
-        (found,) = disk.after(loss).glob("run.rescued-*")
-        assert found.suffix == (".mcap" if then == "publish" else ".part")
-        assert found.read_bytes() == bytes(range(256)), loss
+        (rescued,) = disk.after(loss).glob("run.rescued-*")
+        assert rescued.suffix == (".mcap" if then == "publish" else ".part")
+        assert rescued.read_bytes() == bytes(range(256)), loss
 
 
 # -- a recording ---------------------------------------------------------------------------------
@@ -107,8 +107,8 @@ lose_power()
     _, (left,) = disk.run(program, disk.root / "run.mcap")
     assert left.split()[0] > "000010.seg"
     for loss in Loss:
-        found, warnings = read(disk.after(loss) / "run.mcap")
-        assert found == recorder.truth(6040), loss
+        messages, warnings = read(disk.after(loss) / "run.mcap")
+        assert messages == recorder.truth(6040), loss
         assert "none is missing" in warnings[0]
 
 
@@ -123,12 +123,12 @@ lose_power()
 """
     disk.run(program, disk.root / "run.mcap")
     for loss in Loss:
-        found = disk.after(loss)
-        assert set(names(found)) - {"run.mcap.wal"} == {"run.mcap", "run_0002.mcap"}, loss
-        rows = [*rows_of(found / "run.mcap"), *rows_of(found / "run_0002.mcap")]
+        left = disk.after(loss)
+        assert set(names(left)) - {"run.mcap.wal"} == {"run.mcap", "run_0002.mcap"}, loss
+        rows = [*rows_of(left / "run.mcap"), *rows_of(left / "run_0002.mcap")]
         assert rows == recorder.truth(2000)
         # The write-ahead log may be back: each message is read once all the same.
-        assert read(found / "run.mcap") == (recorder.truth(2000), [])
+        assert read(left / "run.mcap") == (recorder.truth(2000), [])
 
 
 FAULTS = [{"fails": 1, "name": ".part"}, {"fails": 2, "name": ".part"}, {"room": 1000}]
@@ -153,8 +153,8 @@ except LogWriteError as error:
     reason = "No space left on device" if "room" in fault else "Input/output error"
     assert f"{reason}; all {accepted} messages are kept" in error
     for loss in Loss:
-        found, _ = read(disk.after(loss) / "run.mcap")
-        assert found == recorder.truth(int(accepted)), loss
+        messages, _ = read(disk.after(loss) / "run.mcap")
+        assert messages == recorder.truth(int(accepted)), loss
 
 
 @pytest.mark.slow
@@ -174,13 +174,13 @@ sink.close(())
         assert code in (0, -9)
         count = max(map(int, printed), default=0)
         for loss in Loss if count else ():
-            found, _ = read(disk.after(loss) / "run.mcap")
-            found.sort(key=itemgetter(2))
-            assert found[:count] == recorder.truth(count), (loss, number)
+            messages, _ = read(disk.after(loss) / "run.mcap")
+            messages.sort(key=itemgetter(2))
+            assert messages[:count] == recorder.truth(count), (loss, number)
             # Of what came later there may be some, with gaps.
-            times = [message[2] for message in found]
+            times = [message[2] for message in messages]
             assert len(set(times)) == len(times)
-            assert set(found) <= set(recorder.truth(1000))
+            assert set(messages) <= set(recorder.truth(1000))
         if code == 0:
             break
     assert number > 15
@@ -203,6 +203,6 @@ lose_power()
 """
     _, (name,) = disk.run(program, disk.root / "run.mcap")
     for loss in Loss:
-        found = disk.after(loss)
-        assert names(found) == [name]
-        assert len(messages_of(found / name)) == 100
+        left = disk.after(loss)
+        assert names(left) == [name]
+        assert len(messages_of(left / name)) == 100

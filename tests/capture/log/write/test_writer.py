@@ -35,14 +35,14 @@ def test_a_robot_has_its_files_and_its_serial_number_if_it_has_one(tmp_path):
         facts = metadata_of(path)["undulog"]
         assert facts.get("serial", "") == serial
         assert ("serial" in facts) == bool(serial)
-        found = attachments(path)
-        assert {name: found[name].data for name in ("a.stl", "b.obj", "c.xyz")} == {
+        files = attachments(path)
+        assert {name: files[name].data for name in ("a.stl", "b.obj", "c.xyz")} == {
             "a.stl": b"1", "b.obj": b"2", "c.xyz": b"3",
         }  # fmt: skip
-        assert [found[name].media_type for name in ("a.stl", "c.xyz")] == [
+        assert [files[name].media_type for name in ("a.stl", "c.xyz")] == [
             "model/stl", "application/octet-stream",
         ]  # fmt: skip
-        assert found["snake25.dbc"].media_type == "text/plain"
+        assert files["snake25.dbc"].media_type == "text/plain"
     SessionWriter(tmp_path / "none.mcap", **FACTS).close()
     assert metadata_of(tmp_path / "none.mcap")["undulog"]["robot"] == ""
     assert attachments(tmp_path / "none.mcap") == {}
@@ -56,11 +56,11 @@ def test_inputs_and_verdicts_are_stored_with_a_session(tmp_path):
         writer.set_verdict("good")
         writer.close()
         writer.close()
-    found, records = attachments(path), metadata_of(path)
-    assert {name: (one.data, one.media_type) for name, one in found.items()} == {
+    files, records = attachments(path), metadata_of(path)
+    assert {name: (file.data, file.media_type) for name, file in files.items()} == {
         name: (text, "application/toml") for name, text in texts.items()
     }
-    assert {(one.create_time, one.log_time) for one in found.values()} == {(EPOCH_NS, EPOCH_NS)}
+    assert {(file.create_time, file.log_time) for file in files.values()} == {(EPOCH_NS, EPOCH_NS)}
     assert (records["one"], records["two"]) == ({"k": "1"}, {"k": "2"})
     assert records["undulog"].items() >= {"clock.a": "device", "clock.b": "host"}.items()
     health = records["undulog.health"]
@@ -84,9 +84,9 @@ def test_each_kind_of_sensor_has_its_channel_on_its_topic(tmp_path):
     sensors = []
     with SessionWriter(path, **FACTS) as writer:
         for number, kind in enumerate(SensorKind):
-            for known in (False, True):
-                given = limits | {"field_of_view": 0.125} if known else {}
-                sensor = Sensor(f"s{number}{known:d}", kind, "head", (0.0, 0.0, 0.0), **given)
+            for has_range in (False, True):
+                given = limits | {"field_of_view": 0.125} if has_range else {}
+                sensor = Sensor(f"s{number}{has_range:d}", kind, "head", (0.0, 0.0, 0.0), **given)
                 sensors.append(sensor)
                 channel = open_sensor(writer, sensor)
                 assert type(channel) is KINDS[kind]
@@ -94,15 +94,15 @@ def test_each_kind_of_sensor_has_its_channel_on_its_topic(tmp_path):
                 channel.write(EPOCH_NS, value)
         with pytest.raises(DataError, match="is open already"):
             open_sensor(writer, sensors[0])
-    found = {topic: content for topic, _, content in decoded_of(path)}
-    assert set(found) == {sensor.topic for sensor in sensors}
+    contents = {topic: content for topic, _, content in decoded_of(path)}
+    assert set(contents) == {sensor.topic for sensor in sensors}
     for sensor in sensors:
-        message = found[sensor.topic]
+        message = contents[sensor.topic]
         assert message.header.frame_id == sensor.name
         if KINDS[sensor.kind] is RangeChannel:
-            known = sensor.range_min is not None
+            has_range = sensor.range_min is not None
             bounds = (message.min_range, message.max_range, message.field_of_view)
-            assert bounds == ((0.25, 2.5, 0.125) if known else (0.0, 0.0, 0.0))
+            assert bounds == ((0.25, 2.5, 0.125) if has_range else (0.0, 0.0, 0.0))
             assert message.radiation_type == (sensor.kind is SensorKind.IR)
 
 
@@ -111,9 +111,9 @@ def test_rows_longer_than_a_chunk_are_written_one_by_one(tmp_path):
     with SessionWriter(path, **FACTS) as writer:
         channel = writer.joint_state("/j", [name], unit="rad")
         channel.write_rows(EPOCH_NS + np.arange(3), np.arange(3.0)[:, None], none, none)
-    found = [(t_ns, content) for _, t_ns, content in decoded_of(path)]
-    assert [t_ns for t_ns, _ in found] == [EPOCH_NS + k for k in range(3)]
-    assert [(content.name, list(content.position)) for _, content in found] == [
+    contents = [(t_ns, content) for _, t_ns, content in decoded_of(path)]
+    assert [t_ns for t_ns, _ in contents] == [EPOCH_NS + k for k in range(3)]
+    assert [(content.name, list(content.position)) for _, content in contents] == [
         ([name], [float(k)]) for k in range(3)
     ]
 
