@@ -24,7 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support import twin_chains
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.parts.free_motion.measure import fit_motion, free_motion
+from undulog.analysis.parts.body.oscillation import fit_motion
+from undulog.analysis.parts.free_motion.measure import free_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.sim import load_scenario, run_batch
 

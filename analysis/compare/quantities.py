@@ -24,7 +24,7 @@ from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.model import Robot
 
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ..parts.free_motion.measure import (
+from ..parts.body.oscillation import (
     MotionFit,
     Oscillation,
     amplitude,

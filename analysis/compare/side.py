@@ -22,9 +22,9 @@ from undulog.capture.common.untrusted_text import read_toml
 
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
+from ..parts.body.oscillation import MotionFit
 from ..parts.body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..parts.energy.measure import in_all
-from ..parts.free_motion.measure import MotionFit
 from ..parts.joints.measure import SessionMeasurement
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, MetadataChange

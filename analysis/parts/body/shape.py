@@ -28,8 +28,8 @@ from ...results.estimate import Estimate
 from ...results.formats import scaled
 from ...signals.columns import by_plane
 from ...signals.windows import Span
-from ..free_motion.measure import MotionFit, Oscillation, absolute, best_lag, fit_motion, wave_speed
 from .motion import ODOMETRY_TOPIC, head_poses
+from .oscillation import MotionFit, Oscillation, absolute, best_lag, fit_motion, wave_speed
 from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles, mean_step
 
 LEAST_JOINTS = 4

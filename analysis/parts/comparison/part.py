@@ -7,13 +7,11 @@ from ...signals.session_signals import Signals
 from ..gait.part import GAIT
 from ..gaits.part import GAITS
 from ..joints.part import JOINTS
-from ..judgement.measure import (
-    compare_joints,
-)
 from ..judgement.part import JUDGEMENT
 from ..part import Part, Results
 from ..tracking.part import TRACKING
 from .examine import Findings
+from .measure import compare_joints
 
 
 def _comparison(signals: Signals, done: Results, remarks: Remarks) -> Findings:

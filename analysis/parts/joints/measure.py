@@ -24,9 +24,9 @@ from ...results.answer import DeadBand
 from ...results.estimate import Estimate
 from ...signals.columns import Columns, by_plane, planes_of
 from ...signals.windows import Span, Stretch, whole_cycles
+from ..body.oscillation import MotionFit
 from ..body.travel import GaitCycle
 from ..energy.measure import GAP_SHARE, TERMS, Energies
-from ..free_motion.measure import MotionFit
 from ..tracking.gait import GaitOffset
 
 

@@ -10,7 +10,7 @@ from undulog.analysis import Choices, compare_sessions
 from undulog.analysis.compare.decisions import Margins, decide, differ, estimates_of, family
 from undulog.analysis.compare.quantities import common_motion, motion_estimates, motion_of
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.parts.free_motion.measure import fit_motion
+from undulog.analysis.parts.body.oscillation import fit_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import DataError

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from support.viscous_swimmer import Swimmer
 from undulog.analysis.estimators.series import Series
+from undulog.analysis.parts.body.oscillation import fit_motion
 from undulog.analysis.parts.body.shape import plane_shapes
 from undulog.analysis.parts.body.travel import step_of_cycle, virtual_chassis
-from undulog.analysis.parts.free_motion.measure import fit_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.signals.windows import Span
 from undulog.capture import load_robot

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.parts.free_motion.measure import fit_motion, free_motion, local_wave_numbers
+from undulog.analysis.parts.body.oscillation import fit_motion, local_wave_numbers
+from undulog.analysis.parts.free_motion.measure import free_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.capture.robot.description import load_robot
 
