@@ -45,7 +45,7 @@ def test_gravity_leans_as_the_floor_falls(tmp_path, fall):
 
 
 def test_the_heading_is_the_plans_then_the_sessions_then_the_scenarios(tmp_path):
-    given = {"plan": {"heading_rad": "3.14"}, "own": {"heading_rad": "1.5"}, "heading": 0.3}
+    given = {"plan": {"heading_rad": "3.14"}, "metadata": {"heading_rad": "1.5"}, "heading": 0.3}
     for k, heading in enumerate((3.14, 1.5, 0.3)):
         assert read(lying(tmp_path / f"{k}.mcap", **given)).heading_rad == heading
         given.pop(next(iter(given)))
