@@ -20,26 +20,26 @@ from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.extras import attach
 
-from .results.estimate import present_with
+from .common.estimate import present_with
 
 if TYPE_CHECKING:
     from .catalog.catalog import Catalog as Catalog
     from .catalog.fleet import Fleet as Fleet
     from .catalog.fleet import analyse_fleet as analyse_fleet
+    from .common.estimate import Estimate as Estimate
     from .compare.compare import Choices as Choices
     from .compare.compare import compare_sessions as compare_sessions
     from .compare.decisions import Margins as Margins
     from .experiment.analyse import analyse_experiment as analyse_experiment
+    from .parts.heterogeneity.result import Index as Index
+    from .parts.joints.result import JointResult as JointResult
     from .present.result_files import Picture as Picture
     from .present.result_files import load as load
     from .present.text import render as render
     from .results.analysis import Analysis as Analysis
-    from .results.analysis import Index as Index
-    from .results.analysis import JointResult as JointResult
     from .results.comparison import Comparison as Comparison
     from .results.coupling import LinearCoupling as LinearCoupling
     from .results.coupling import LocalCoupling as LocalCoupling
-    from .results.estimate import Estimate as Estimate
     from .results.experiment import Experiment as Experiment
     from .results.experiment import Reversal as Reversal
     from .session.analyse import analyse_session as analyse_session

@@ -14,21 +14,22 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.parts.artefacts.result import Artefact
+from undulog.analysis.parts.body.result import BodyPoint, BodyTravel, Serpenoid, ShapeMode
+from undulog.analysis.parts.energy.result import Transport
 from undulog.analysis.parts.episodes.result import EpisodesResult
-from undulog.analysis.results import analysis, answer, oscillators
+from undulog.analysis.parts.free_motion.result import BodyWave, JointMotion, LocalWaveNumber
+from undulog.analysis.parts.frequency_response.result import JointFrequencyResponse
+from undulog.analysis.parts.gait.result import GaitFacts, GroupFacts
+from undulog.analysis.parts.gaits.result import GaitWindow, JointInWindow
+from undulog.analysis.parts.ground_contact.result import LinkContact
+from undulog.analysis.parts.joints.result import JointResult
+from undulog.analysis.parts.tracking.result import JointTracking
 from undulog.analysis.results.analysis import KEYS_OF_THEIR_OWN, Analysis, interval_key
-from undulog.analysis.results.body import BodyPoint, BodyTravel, LinkContact, Serpenoid, ShapeMode
 from undulog.analysis.results.comparison import Comparison
-from undulog.analysis.results.cycles import Transport
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.experiment import Experiment
-from undulog.analysis.results.frequency_response import (
-    BodyWave,
-    JointFrequencyResponse,
-    JointMotion,
-    JointTracking,
-    LocalWaveNumber,
-)
+from undulog.analysis.results.oscillators import ClosedLoop
 
 VERSION = 1
 
@@ -37,18 +38,18 @@ RESULTS: dict[str, tuple[type, str]] = {
     "experiment": (Experiment, "undulog analyse FILE FILE ... --json"),
     "comparison": (Comparison, "undulog compare A B --json"),
     "episodes": (EpisodesResult, "undulog analyse DATASET --json"),
-    "prediction": (oscillators.ClosedLoop, "undulog predict FILE --eps EPS --json"),
+    "prediction": (ClosedLoop, "undulog predict FILE --eps EPS --json"),
 }
 """Name of each result to its dataclass and the command that prints it."""
 
 _FLAT = frozenset(
     {
         BodyPoint,
-        analysis.GaitFacts,
-        analysis.GaitWindow,
-        analysis.GroupFacts,
-        analysis.JointInWindow,
-        analysis.JointResult,
+        GaitFacts,
+        GaitWindow,
+        GroupFacts,
+        JointInWindow,
+        JointResult,
         Transport,
         BodyTravel,
         BodyWave,
@@ -64,7 +65,7 @@ _FLAT = frozenset(
 """Records of a session whose estimates are two keys each, as :meth:`.Analysis.to_dict` has them."""
 
 _DERIVED: dict[type, dict[str, Any]] = {
-    answer.Artefact: {"about": {"type": "string"}},
+    Artefact: {"about": {"type": "string"}},
     BodyWave: {"direction": {"enum": ["first-to-last", "last-to-first", "undecided"]}},
 }
 _INTERVAL = {
@@ -107,7 +108,7 @@ class _Writer:
         self._flat = flat
 
     def record(self, cls: type) -> dict[str, Any]:
-        hints = get_type_hints(cls, localns=vars(oscillators))
+        hints = get_type_hints(cls)
         described = _descriptions(cls)
         properties: dict[str, Any] = {}
         for field in fields(cls):

@@ -19,12 +19,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from undulog.analysis.parts.over_time.measure import cycle_maps
+from undulog.analysis.common.formats import p_value_text
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.comparison import Comparison, ModelledAnalysis
 from undulog.analysis.results.experiment import Experiment
-from undulog.analysis.results.formats import p_value_text
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.cycle_maps import cycle_maps
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import DataError, UndulogError

@@ -20,8 +20,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
-from undulog.analysis.parts.over_time.measure import CycleMaps
 from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.session.cycle_maps import CycleMaps
 from undulog.capture import SessionView
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop, part_file

@@ -25,9 +25,9 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from undulog.analysis import analyse_session
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.parts.body.result import BodyPoint
 from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.body import BodyPoint
-from undulog.analysis.results.estimate import Estimate
 from undulog.capture import Session
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex

@@ -36,7 +36,7 @@ from scipy.special import ndtri
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ..results.estimate import Interval
+from ..common.estimate import Interval
 from .session_noise import SessionNoise, estimate_noise, scatter, simulate
 
 LEVEL = 0.01

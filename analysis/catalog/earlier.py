@@ -30,8 +30,8 @@ from undulog.capture.judgement.levels import (
     reaches,
 )
 
+from ..common.estimate import Interval
 from ..estimators.intervals import holm, t_factor, welch_satterthwaite
-from ..results.estimate import Interval
 from .joint_tables import Frame, column, conditions_of, pivoted, values_of
 
 _SOURCES = {

@@ -17,8 +17,8 @@ import pandas as pd
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import MissingExtraError
 
+from ..common.estimate import Interval
 from ..estimators.intervals import holm
-from ..results.estimate import Interval
 from .change_points import (
     LEAST_SESSIONS,
     ChangePoint,

@@ -211,12 +211,12 @@ def _line(
 
 def line_of(analysis: Analysis) -> SessionLine:
     """Return the line of a session in a table."""
-    from ..results import formats
+    from ..parts.gait.show import gait_frequency
 
     answer, periodic = analysis.answer, analysis.gait.frequency_hz.value is not None
     return SessionLine(
         robot=analysis.session.robot or "",
-        gait=formats.gait_frequency(analysis.gait) if periodic else "",
+        gait=gait_frequency(analysis.gait) if periodic else "",
         verdict=answer.verdict,
         sentence=answer.sentence,
         facts=analysis.to_dict(),

@@ -254,9 +254,9 @@ def _page(
 ) -> tuple[str, Analysis]:
     from undulog.capture import Session
 
-    from ..parts.over_time.measure import cycle_maps
     from ..present.page import render
     from ..session.analyse import measure_session
+    from ..session.cycle_maps import cycle_maps
 
     with Session.open(file, robot=robot) as session:
         measured = measure_session(session, options)
@@ -345,9 +345,9 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
     """Return one page on sessions by themselves."""
     from undulog.capture import Session
 
-    from ..parts.over_time.measure import cycle_maps
     from ..present.page import SessionsPage
     from ..session.analyse import measure_session
+    from ..session.cycle_maps import cycle_maps
 
     page = SessionsPage()
 

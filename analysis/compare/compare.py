@@ -19,12 +19,12 @@ from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.common.extras import base_versions
 
+from ..common.answer import NotFollowing, StandOut
+from ..common.estimate import Estimate, Provenance
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..parts.comparison.examine import OFFSET_RAD
 from ..parts.comparison.words import deviation_in_words, fault_in_words
-from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
-from ..results.estimate import Estimate, Provenance
 from ..session.runs import GaitRun, command_difference, other_frequency
 from ..signals.stretch import Options
 from .decisions import (

@@ -13,10 +13,10 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 
+from ..common import formats
+from ..common.estimate import Estimate, leaves_out_zero
 from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p, holm
-from ..results import formats
 from ..results.comparison import BODY, BrokenJoint, Difference, Equivalence, NamedJoint, of_body
-from ..results.estimate import Estimate, leaves_out_zero
 from .quantities import Differences, Key, Quantities, from_runs, independent, paired
 from .side import ComparedSession
 

@@ -25,10 +25,10 @@ from ..estimators.series import GAP_FACTOR, Series
 from ..parts.body.oscillation import MotionFit
 from ..parts.body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..parts.energy.measure import in_all
-from ..parts.joints.measure import SessionMeasurement
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, MetadataChange
 from ..session.analyse import measure_session
+from ..session.measurement import SessionMeasurement
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span

@@ -14,10 +14,10 @@ import numpy as np
 from undulog.capture.common.console import plain
 from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import t_factor
 from ..parts.tracking.gait import GaitOffset
-from ..results.estimate import Estimate
-from ..results.frequency_response import JointTracking
+from ..parts.tracking.result import JointTracking
 from .quantities import Key, Known
 
 OTHER_COMMAND = 0.25

@@ -37,7 +37,7 @@ from scipy.special import chdtri, gammaln, stdtr, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 
-from ..results.estimate import Estimate, Interval
+from ..common.estimate import Estimate, Interval
 from .spectrum import ResidualBins
 
 EQUIVALENT_GAIN = 0.02

@@ -17,6 +17,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.extras import base_versions
 from undulog.capture.robot.model import Robot
 
+from ..common.estimate import Provenance
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.predictions import body_oscillators
 from ..parts.body.connection import MIN_GAITS
@@ -24,9 +25,8 @@ from ..parts.body.connection import MOST_CONDITION as MOST_SHAPE_CONDITION
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
-from ..results.body import BodyConnection
+from ..results.body_connection import BodyConnection
 from ..results.coupling import Coupling, LocalCoupling
-from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
 from ..session.analyse import measure_session
 from ..session.runs import (

@@ -10,10 +10,11 @@ import numpy as np
 
 from undulog.capture.judgement.naming import NAMED
 
+from ..common import formats
+from ..common.answer import Answer, NotFollowing
+from ..common.estimate import Estimate, leaves_out_zero
 from ..parts.comparison.words import fault_in_words
-from ..results import formats
 from ..results.analysis import Analysis
-from ..results.answer import Answer, NotFollowing
 from ..results.coupling import (
     Coupling,
     LinearCoupling,
@@ -24,7 +25,6 @@ from ..results.coupling import (
     RunScatter,
     ToneCoupling,
 )
-from ..results.estimate import Estimate, leaves_out_zero
 from ..results.experiment import OrderedPair, Reversal
 from ..session.runs import Role
 from .pooling import PooledResponse

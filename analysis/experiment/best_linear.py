@@ -28,12 +28,12 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
+from ..common import formats
+from ..common.estimate import Estimate
 from ..parts.frequency_response.excitation import ExcitationKind
 from ..parts.frequency_response.measure import joint_response, sound_lines
 from ..parts.frequency_response.nonparametric import LineResponse, line_power, noise_power
-from ..results import formats
-from ..results.estimate import Estimate
-from ..results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
+from ..results.best_linear import BestLinearJoint, BestLinearResponses, CrossResponse
 from .distortion_spread import DistortionSpread, LevelSpread, distortion_spread
 from .multisine_runs import MultisineRun
 from .sweep_runs import MOST_CONDITION

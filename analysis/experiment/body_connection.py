@@ -10,12 +10,13 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 
+from ..common import formats
+from ..common.estimate import Estimate
 from ..estimators.intervals import around
 from ..parts.body.connection import Connection, condition_of, distances, fit_connection
+from ..parts.body.result import ShapeMode
 from ..parts.body.travel import GaitCycle, mean_step, wave_at
-from ..results import formats
-from ..results.body import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
-from ..results.estimate import Estimate
+from ..results.body_connection import BodyConnection, ConnectionEntry, PredictedTravel
 
 MOST_DISTANCE = 0.3
 """A gait whose joints differ from the central one by more than this share is another gait."""

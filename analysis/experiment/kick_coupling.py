@@ -19,6 +19,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import CONFIDENCE, NoisyMatrix, around
 from ..results.coupling import (
     BaseResponse,
@@ -31,7 +32,6 @@ from ..results.coupling import (
     RunScatter,
     rows_of,
 )
-from ..results.estimate import Estimate
 from .kick_runs import MOST_KICK, Kick, KickExperiment, KickKind, missing_kicks
 from .local_coupling import (
     LocalMatrices,

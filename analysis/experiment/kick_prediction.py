@@ -16,12 +16,12 @@ from scipy.linalg import expm
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
+from ..common import formats
+from ..common.estimate import Estimate
 from ..estimators.intervals import TAILS, NoisyMatrix, noise_draws
 from ..oscillators.laplacian import intervals_of, spectrum
 from ..oscillators.predictions import felt_response, measured, relaxation
-from ..results import formats
 from ..results.coupling import BaseResponse, LocalCoupling, rows_of
-from ..results.estimate import Estimate
 from ..results.oscillators import ClosedLoop, LoopMode, Relaxation
 from .local_coupling import stacked
 

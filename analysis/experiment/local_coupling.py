@@ -40,6 +40,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import (
     CONFIDENCE,
     NoisyMatrix,
@@ -48,7 +49,6 @@ from ..estimators.intervals import (
     welch_satterthwaite,
 )
 from ..results.coupling import LTI_LABEL, Lti, rows_of
-from ..results.estimate import Estimate
 from .kick_runs import Kick, KickKind
 from .run_scatter import RunErrors, run_errors, sides
 

@@ -35,12 +35,12 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray, fr
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.null_model import NullModel, read_null_model
 
+from ..common.answer import beyond, distinct
+from ..common.estimate import Estimate, Provenance
 from ..estimators.intervals import CONFIDENCE, t_factor
-from ..parts.joints.measure import SessionMeasurement
 from ..response.fitting import GaitFit
 from ..response.response import Response
 from ..results.analysis import Analysis
-from ..results.answer import beyond, distinct
 from ..results.comparison import (
     SIGNIFICANT,
     ModelledAnalysis,
@@ -49,8 +49,8 @@ from ..results.comparison import (
     SharedEstimate,
     null_answer,
 )
-from ..results.estimate import Estimate, Provenance
 from ..session.analyse import measure_session
+from ..session.measurement import SessionMeasurement
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
 from .mirror import parts

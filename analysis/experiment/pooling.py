@@ -21,14 +21,15 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.judgement.fault import Judgement
 from undulog.capture.robot.model import Robot
 
+from ..common.answer import Answer, NotFollowing
+from ..common.estimate import Interval
 from ..parts.comparison.answer import Facts, compose
 from ..parts.comparison.examine import Chain, examine
 from ..parts.comparison.profile import Scatter
 from ..parts.heterogeneity.measure import spread
+from ..parts.heterogeneity.result import Index
 from ..response.response import Response
-from ..results.analysis import Analysis, Index
-from ..results.answer import Answer, NotFollowing
-from ..results.estimate import Interval
+from ..results.analysis import Analysis
 from ..results.experiment import Reversal
 from ..signals.columns import by_plane
 from .mirror import MIN_RUNS, parts

@@ -41,6 +41,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
+from ..common.estimate import Estimate, Interval
 from ..estimators.intervals import (
     CONFIDENCE,
     EQUIVALENT_GAIN,
@@ -49,7 +50,6 @@ from ..estimators.intervals import (
     equivalence_p,
     t_factor,
 )
-from ..results.estimate import Estimate, Interval
 from ..results.experiment import FloorTilt, Headings, MirrorJoint, OrderedPair, Reversal
 from .mirror import MirrorTest, mirror_test
 

@@ -36,9 +36,9 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Servo
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 from ..results.coupling import ComplexMatrix, Coupling, LinearCoupling, Route, ToneCoupling, rows_of
-from ..results.estimate import Estimate
 from ..signals.stretch import Options
 from .local_coupling import SINGULAR, UNKNOWN_SHAPE, reciprocity
 from .sweep_runs import CommandTones, Sweep, SweepData, sweep_data

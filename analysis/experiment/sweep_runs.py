@@ -21,11 +21,11 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.run import TwinRun
 
+from ..common.remarks import Remarks
 from ..estimators.series import Series, clean
 from ..response.changes import DRIFT_PER_CYCLE
 from ..response.fitting import GaitFit
 from ..response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
-from ..results.answer import Remarks
 from ..session.runs import SAME_FREQUENCY
 from ..signals.columns import read_columns
 from ..signals.stretch import Options, choose_stretch

@@ -27,12 +27,12 @@ import numpy as np
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError
 
+from ..common.estimate import Estimate
 from ..estimators.harmonic import RELATIVE_FLOOR
 from ..estimators.intervals import DRAWS, norm_ratio
 from ..estimators.series import Series, shared_times
 from ..estimators.spectrum import BINS_PER_SIDE, KEPT_POWER
 from ..response.rhythm import NYQUIST_SHARE
-from ..results.estimate import Estimate
 from .local_coupling import squared
 
 _NEAREST = 6

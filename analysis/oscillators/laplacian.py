@@ -33,9 +33,9 @@ from scipy.linalg import eig
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import CONFIDENCE, TAILS, NoisyMatrix, noise_draws
 from ..results.coupling import rows_of
-from ..results.estimate import Estimate
 from ..results.oscillators import Levels
 
 STRONG = 0.1

@@ -37,10 +37,10 @@ from scipy.special import stdtridf, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
+from ..common import formats
+from ..common.estimate import Estimate
 from ..estimators.intervals import CONFIDENCE, TAILS, NoisyMatrix, noise_draws
-from ..results import formats
 from ..results.coupling import LocalCoupling, Matrix, rows_of
-from ..results.estimate import Estimate
 from ..results.oscillators import (
     ENTRAINMENT_LABEL,
     BodyOscillators,

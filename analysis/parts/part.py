@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
-    from ..results.answer import Remarks
+    from ..common.remarks import Remarks
     from ..signals.session_signals import Signals
     from .shown import Shown
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
-from ..results import formats
-from ..results.estimate import Estimate
+from ..common import formats
+from ..common.estimate import Estimate
 
 Row = TypeVar("Row")
 Digits = int | Callable[[Sequence[Estimate]], int]

@@ -41,8 +41,8 @@ from undulog.capture.robot.model import Robot
 
 from ..experiment.pooling import pool_runs
 from ..parts.heterogeneity.measure import response_indices
+from ..parts.heterogeneity.result import Index
 from ..response.response import Response
-from ..results.analysis import Index
 from ..results.coupling import LocalCoupling
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY, GaitRun, command_change
 from .runs import BaseGait

@@ -17,7 +17,8 @@ from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
-from ..results.answer import Remarks, percent
+from ..common.answer import percent
+from ..common.remarks import Remarks
 from ..session.analyse import measure_session
 from ..signals.columns import read_columns
 

@@ -19,10 +19,11 @@ from markupsafe import Markup
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.palette import joint_hex, scale_ends
 
-from ..parts.over_time.measure import CycleMaps
-from ..results.estimate import Estimate
-from ..results.formats import decimals_for_values, degrees, estimate, number, short
-from ..results.frequency_response import BestLinearJoint, JointFrequencyResponse
+from ..common.estimate import Estimate
+from ..common.formats import decimals_for_values, degrees, estimate, number, short
+from ..parts.frequency_response.result import JointFrequencyResponse
+from ..results.best_linear import BestLinearJoint
+from ..session.cycle_maps import CycleMaps
 from .page_tables import LEVELS, color_bar, element, hue, svg_element
 from .svg import Drawing, band, drawing, inline_svg, key, legend
 

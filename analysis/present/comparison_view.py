@@ -18,6 +18,9 @@ from undulog.capture.common.palette import joint_hex
 from ..catalog.earlier import departure_sentence
 from ..catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
 from ..catalog.fleet import sentence as change_sentence
+from ..common import formats
+from ..common.estimate import Estimate
+from ..common.formats import estimate, scaled, short
 from ..compare.decisions import (
     RESPONSE,
     SIGNIFICANT_DIFFERENCE,
@@ -25,10 +28,7 @@ from ..compare.decisions import (
     margin_text,
     signed_difference,
 )
-from ..results import formats
 from ..results.comparison import BODY, Comparison, of_body
-from ..results.estimate import Estimate
-from ..results.formats import estimate, scaled, short
 from .page_tables import Fact, Trial, joint_mark
 from .svg import (
     COMMAND,

@@ -20,9 +20,17 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
-from ..results.analysis import Analysis, GaitFacts, Index, JointInWindow, JointResult
-from ..results.answer import Artefact, Span
-from ..results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
+from ..common.estimate import Estimate
+from ..parts.artefacts.result import Artefact, Span
+from ..parts.body.result import BodyPoint, BodyTravel, Serpenoid
+from ..parts.gait.result import GaitFacts
+from ..parts.gaits.result import JointInWindow
+from ..parts.heterogeneity.result import Index
+from ..parts.joints.result import JointResult
+from ..parts.oscillators.result import ChainCoupling, OscillatorLink, Rate
+from ..parts.tracking.result import JointTracking
+from ..results.analysis import Analysis
+from ..results.body_connection import PredictedTravel
 from ..results.comparison import Comparison, Difference, Equivalence, MetadataChange, NamedJoint
 from ..results.coupling import (
     Coupling,
@@ -33,10 +41,8 @@ from ..results.coupling import (
     RowCheck,
     ToneCoupling,
 )
-from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
-from ..results.frequency_response import JointTracking
-from ..results.oscillators import ChainCoupling, Mode, OscillatorLink, Rate
+from ..results.oscillators import Mode
 from .text import shown_parts
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
@@ -47,7 +53,7 @@ SUFFIX = ".csv"
 def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.DataFrame:
     """Return dataclasses of one kind as a table.
 
-    An :class:`~.analysis.results.estimate.Estimate` named ``lag_rad`` becomes ``lag_rad``,
+    An :class:`~.analysis.common.estimate.Estimate` named ``lag_rad`` becomes ``lag_rad``,
     ``lag_low_rad`` and ``lag_high_rad``; a field ``ci95`` becomes ``low`` and ``high``; tuples of
     words are joined by spaces. Fields that hold other structures are left out.
 
@@ -115,7 +121,7 @@ Frames = dict[str, pd.DataFrame]
 
 
 def frames_of(result: object) -> Frames:  # noqa: PLR0911 - one kind of result a case
-    """Return the tables of a result; see :meth:`.analysis.results.estimate.PresentedResult.frames`.
+    """Return the tables of a result; see :meth:`.analysis.common.estimate.PresentedResult.frames`.
 
     Raises:
         TypeError: If it is no result of this package.

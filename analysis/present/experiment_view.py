@@ -13,15 +13,15 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.palette import joint_hex
 
+from ..common import formats
+from ..common.estimate import Estimate, leaves_out_zero
+from ..common.formats import degrees, estimate, relative, short
 from ..experiment.answer import kick_checks, sweep_checks
 from ..experiment.body_connection import connection_detail
 from ..experiment.sweep_coupling import NONLINEAR
-from ..results import formats
-from ..results.body import BodyConnection
+from ..results.body_connection import BodyConnection
 from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ..results.estimate import Estimate, leaves_out_zero
 from ..results.experiment import Experiment, Reversal
-from ..results.formats import degrees, estimate, relative, short
 from .bode import best_linear_bode
 from .matrix import entries_of, matrix_picture
 from .oscillators import body_facts, entrainment_entries, modes_drawing

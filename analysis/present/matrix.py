@@ -17,8 +17,8 @@ from markupsafe import Markup
 
 from undulog.capture.common.arrays import FloatArray
 
+from ..common.formats import decimals_for_values, number, short
 from ..results.coupling import ComplexMatrix, Coupling, LinearCoupling, LocalCoupling
-from ..results.formats import decimals_for_values, number, short
 from .page_tables import color_bar, element, joined, svg_element
 from .svg import Drawing
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..results import formats
+from ..common import formats
 from ..results.oscillators import BodyOscillators
 from .matrix import Entries
 from .page_tables import Fact

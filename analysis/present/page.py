@@ -46,13 +46,13 @@ from undulog.capture.common.process import interrupted_later
 from undulog.capture.common.waits import end_process
 
 from ..catalog.fleet import Fleet
-from ..parts.over_time.measure import CycleMaps
-from ..results import formats
+from ..common import formats
+from ..common.answer import beyond
+from ..common.estimate import Provenance
 from ..results.analysis import Analysis
-from ..results.answer import beyond
 from ..results.comparison import Comparison
-from ..results.estimate import Provenance
 from ..results.experiment import Experiment
+from ..session.cycle_maps import CycleMaps
 from . import response_tables, tables
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view

@@ -12,13 +12,16 @@ from markupsafe import Markup, escape
 
 from undulog.capture.common.console import plain
 
+from ..common import formats
+from ..common.estimate import Estimate
 from ..experiment.reversal import SIGNIFICANT
 from ..parts.comparison.answer import find
+from ..parts.gait.show import gait_frequency
+from ..parts.heterogeneity.result import Index
+from ..parts.joints.result import JointResult
 from ..parts.shown import PAGE, Cell, Ends, PValue, ShownNumber, Table
-from ..results import formats
-from ..results.analysis import Analysis, Index, JointResult
+from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling, RowCheck
-from ..results.estimate import Estimate
 from ..results.experiment import Experiment, Reversal
 
 STILL_RAD = 1e-6
@@ -256,7 +259,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
         for plane, lag in gait.lag_per_joint_rad.items()
     ]
     facts = [
-        Fact("Gait frequency", formats.gait_frequency(gait), _analysed(analysis)),
+        Fact("Gait frequency", gait_frequency(gait), _analysed(analysis)),
         Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), ", ".join(steps)),
         Fact("Joints in the gait", count),
         _range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""),

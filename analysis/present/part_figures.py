@@ -9,8 +9,8 @@ import numpy as np
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
 
-from ..results.estimate import Estimate
-from ..results.formats import estimate, short
+from ..common.estimate import Estimate
+from ..common.formats import estimate, short
 from .bode import MARKERS
 from .svg import Drawing, band, drawing, inline_svg, key, legend
 

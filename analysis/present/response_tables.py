@@ -5,18 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+from ..common.estimate import Estimate
+from ..common.formats import degrees, scaled
+from ..parts.free_motion.result import BodyWave, JointMotion, LocalWaveNumber
+from ..parts.frequency_response.result import DIRECT, JointFrequencyResponse
+from ..parts.gaits.result import GaitWindow
 from ..parts.shown import Column, Ends, ShownNumber, Table, typical
-from ..results.analysis import GaitWindow
-from ..results.estimate import Estimate
-from ..results.formats import degrees, scaled
-from ..results.frequency_response import (
-    DIRECT,
-    BodyWave,
-    JointFrequencyResponse,
-    JointMotion,
-    JointTracking,
-    LocalWaveNumber,
-)
+from ..parts.tracking.result import JointTracking
 
 
 def frequency_table(responses: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:

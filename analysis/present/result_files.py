@@ -22,14 +22,14 @@ from undulog.capture.common.errors import DataError, MissingExtraError, UsageErr
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 from undulog.capture.common.untrusted_text import read_json
 
+from ..common import formats
+from ..common.estimate import Estimate, PresentedResult
+from ..common.formats import degrees, relative
 from ..experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
-from ..results import analysis, formats, oscillators
 from ..results.analysis import Analysis, interval_key
 from ..results.comparison import Comparison
 from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ..results.estimate import Estimate, PresentedResult
 from ..results.experiment import Experiment, Reversal
-from ..results.formats import degrees, relative
 from .data_frames import frames_of as frames
 from .text import render, unidentified
 from .text_experiment import render_comparison, render_experiment, reversal_detail
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 
 __all__ = ["frames", "headline", "html", "load", "picture", "save", "save_tables", "text"]
 
-
-_NAMES = {**vars(oscillators), **vars(analysis)}
-"""Types that :mod:`.analysis.results.analysis` names for type checkers only."""
 
 _KINDS: tuple[type[PresentedResult], ...] = (
     Analysis,
@@ -61,7 +58,7 @@ _VARIABLE = re.compile(r"--([\w-]+):\s*([^;]+);")
 
 
 def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
-    """Write a result as JSON; see :meth:`.analysis.results.estimate.PresentedResult.save`."""
+    """Write a result as JSON; see :meth:`.analysis.common.estimate.PresentedResult.save`."""
     check_output(path, (".json",), "the result file is JSON; end its name in .json", force=force)
     write_text(path, json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     return path
@@ -163,7 +160,7 @@ def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
         if _required(candidate) <= set(data)
     ]
     chosen = max(fitting, key=lambda candidate: len(dataclasses.fields(candidate)), default=kind)
-    hints = get_type_hints(chosen, localns=_NAMES)
+    hints = get_type_hints(chosen)
     built: dict[str, Any] = {}
     for field in dataclasses.fields(chosen):
         name = field.name
@@ -344,7 +341,7 @@ _number = count(1)
 
 
 def picture(result: object, what: str | None = None) -> Picture:
-    """Draw a result; see :meth:`.analysis.results.estimate.PresentedResult.plot`.
+    """Draw a result; see :meth:`.analysis.common.estimate.PresentedResult.plot`.
 
     Args:
         result: A result of this package.

@@ -12,11 +12,11 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ..results.analysis import JointResult
-from ..results.body import BodyPoint, BodyResult
-from ..results.estimate import Estimate
-from ..results.formats import degrees, estimate, number, scaled, short
-from ..results.frequency_response import JointTracking
+from ..common.estimate import Estimate
+from ..common.formats import degrees, estimate, number, scaled, short
+from ..parts.body.result import BodyPoint, BodyResult
+from ..parts.joints.result import JointResult
+from ..parts.tracking.result import JointTracking
 from .page_tables import is_driven
 from .svg import (
     ABOVE,

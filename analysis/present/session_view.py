@@ -16,12 +16,14 @@ from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.palette import joint_hex
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
-from ..parts.over_time.measure import CycleMaps
-from ..results import formats
-from ..results.analysis import Analysis, JointResult
-from ..results.answer import KINDS, Artefact, Span, Verdict
-from ..results.formats import degrees, estimate, short
-from ..results.oscillators import ChainCoupling
+from ..common import formats
+from ..common.answer import Verdict
+from ..common.formats import degrees, estimate, short
+from ..parts.artefacts.result import KINDS, Artefact, Span
+from ..parts.joints.result import JointResult
+from ..parts.oscillators.result import ChainCoupling
+from ..results.analysis import Analysis
+from ..session.cycle_maps import CycleMaps
 from .bode import bode, cycle_drawings
 from .matrix import Entries, entries_of, matrix_picture
 from .page_tables import element, is_driven, joint_mark, key_figures, session_trials

@@ -31,8 +31,8 @@ from matplotlib.figure import Figure as _Figure
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 
-from ..results.estimate import Estimate
-from ..results.formats import short
+from ..common.estimate import Estimate
+from ..common.formats import short
 
 Figure: TypeAlias = Any
 Axes: TypeAlias = Any

@@ -12,6 +12,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+from ..common import formats
+from ..common.estimate import Estimate
+from ..common.formats import degrees, scaled
 from ..compare.decisions import (
     SIGNIFICANT_DIFFERENCE,
     WORDS,
@@ -21,14 +24,13 @@ from ..compare.decisions import (
     signed,
     signed_difference,
 )
+from ..parts.body.result import BodyPoint, BodyResult
+from ..parts.heterogeneity.result import Index
+from ..parts.joints.result import JointResult
 from ..parts.shown import Column, Ends, PValue, ShownNumber, Table, typical
-from ..results import formats
-from ..results.analysis import Analysis, Index, JointResult
-from ..results.body import BodyPoint, BodyResult
+from ..results.analysis import Analysis
 from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, of_body
-from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
-from ..results.formats import degrees, scaled
 
 _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | None], ...] = (
     ("E_net", "integral of torque times velocity", lambda j: j.energy_net_j, 3),

@@ -12,16 +12,19 @@ import numpy as np
 from undulog.capture.common import console as text_table
 from undulog.capture.common.console import UNLIMITED, plain
 
+from ..common import formats
+from ..common.estimate import Estimate
+from ..parts.body.result import BodyShape, PlaneShape
+from ..parts.energy.result import EnergyResult
+from ..parts.free_motion.result import FreeMotion
+from ..parts.gait.show import gait_frequency
+from ..parts.ground_contact.result import GroundContact
+from ..parts.oscillators.result import ChainCoupling
 from ..parts.shown import TERMINAL, AnyTable, Cell, Column, Ends, PValue, Shown, ShownNumber, Table
-from ..results import formats
 from ..results.analysis import Analysis
-from ..results.body import BodyShape, GroundContact, PlaneShape
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
-from ..results.cycles import EnergyResult
-from ..results.estimate import Estimate
-from ..results.frequency_response import FreeMotion
-from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
+from ..results.oscillators import BodyOscillators, ClosedLoop, LoopMode
 from . import tables
 from .response_tables import (
     frequency_table,
@@ -332,7 +335,7 @@ def _method(analysis: Analysis) -> str:
     if len(gait.groups) > 1:
         rhythm = (
             "one frequency for each group of joints, with the harmonics of all in every joint: "
-            f"{formats.gait_frequency(gait)}"
+            f"{gait_frequency(gait)}"
         )
     return (
         f"Method: harmonic least squares{span} on each sample's own time, {rhythm}; "

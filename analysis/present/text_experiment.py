@@ -9,20 +9,20 @@ from typing import Literal
 
 from undulog.capture.common.console import UNLIMITED, plain
 
+from ..common import formats
+from ..common.estimate import Estimate
+from ..common.formats import scaled
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
 from ..experiment.best_linear import multisine_method
 from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal import SIGNIFICANT
 from ..parts.shown import Column, Table, typical
-from ..results import formats
-from ..results.body import BodyConnection, PredictedTravel
+from ..results.best_linear import BestLinearJoint
+from ..results.body_connection import BodyConnection, PredictedTravel
 from ..results.comparison import Comparison, MetadataChange
 from ..results.coupling import LinearCoupling, LocalCoupling
-from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
-from ..results.formats import scaled
-from ..results.frequency_response import BestLinearJoint
 from .tables import difference_table, mirror_table, run_table, waveform_table
 from .text import Sheet, body_detail, unidentified
 

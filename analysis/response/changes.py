@@ -22,13 +22,13 @@ from scipy.special import fdtrc
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
+from ..common.estimate import Estimate
 from ..estimators.demodulation import amplitudes, cycle_sums, starts_of
 from ..estimators.harmonic import HarmonicFit, cos_sin
 from ..estimators.intervals import ResponseErrors, around, t_factor
 from ..estimators.series import Series, shared_times
 from ..estimators.slow_changes import EXCESS, MOST_CYCLES, CycleNoise, SlowChanges, slow_changes
 from ..estimators.trends import MIN_CYCLES, Trend
-from ..results.estimate import Estimate
 from .response import Response
 from .rhythm import NYQUIST_SHARE
 

@@ -11,6 +11,9 @@ import numpy as np
 from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 
+from ..common.answer import distinct, percent
+from ..common.estimate import Estimate
+from ..common.remarks import Lacking, Note
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import (
@@ -21,8 +24,6 @@ from ..estimators.spectrum import (
 )
 from ..estimators.trends import Trend
 from ..estimators.turning import turning_beside_others
-from ..results.answer import Lacking, Note, distinct, percent
-from ..results.estimate import Estimate
 from .changes import (
     LEAST_CYCLES,
     LEAST_EFFECTIVE,

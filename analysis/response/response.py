@@ -14,6 +14,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
+from ..common.estimate import Estimate
 from ..estimators.intervals import (
     ResponseErrors,
     around,
@@ -22,7 +23,6 @@ from ..estimators.intervals import (
     welch_satterthwaite,
 )
 from ..estimators.spectrum import FundamentalNoise, ResidualBins
-from ..results.estimate import Estimate
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError
 
+from ..common.answer import percent
+from ..common.remarks import Lacking, Refusal
 from ..estimators.harmonic import HarmonicModel, fit_at, fit_shared
 from ..estimators.series import Series, moves
-from ..results.answer import Lacking, Refusal, percent
 from .groups import Groups
 from .rhythm import MIN_CYCLES, MIN_EXPLAINED, MIN_SAMPLES, NYQUIST_SHARE, liveliest
 

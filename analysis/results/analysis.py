@@ -12,35 +12,28 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
-from .answer import Answer, Artefact, DeadBand
-from .body import BodyPoint, BodyResult, BodyShape, GroundContact
+from ..common.answer import Answer
+from ..common.estimate import Estimate, PresentedResult, Provenance
+from ..parts.artefacts.result import Artefact
+from ..parts.body.result import BodyPoint, BodyResult, BodyShape
+from ..parts.energy.result import EnergyResult
+from ..parts.free_motion.result import FreeMotion
+from ..parts.frequency_response.result import JointFrequencyResponse
+from ..parts.gait.result import GaitFacts
+from ..parts.gaits.result import GaitWindow
+from ..parts.ground_contact.result import GroundContact
+from ..parts.heterogeneity.result import Index
+from ..parts.joints.result import JointResult
+from ..parts.oscillators.result import ChainCoupling
+from ..parts.over_time.result import ResponseOverTime
+from ..parts.tracking.result import JointTracking
 from .coupling import Coupling
-from .cycles import EnergyResult, ResponseOverTime
-from .estimate import Estimate, PresentedResult, Provenance, WithInterval
-from .frequency_response import FreeMotion, JointFrequencyResponse, JointTracking
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from .oscillators import ChainCoupling
-
 KEYS_OF_THEIR_OWN = {"json": "keys of their own"}
 """Marks a field whose values stand beside the others in the JSON, under keys of their own."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """A half-open stretch of the session that was analysed.
-
-    Attributes:
-        start_s: From the session's start [s].
-        stop_s: From the session's start [s].
-        cycles: Gait cycles in it; 0 where there is no gait.
-    """
-
-    start_s: float
-    stop_s: float
-    cycles: float
 
 
 @dataclass(frozen=True)
@@ -62,178 +55,6 @@ class SessionFacts:
     start_ns: int
     duration_s: float
     verdict: str | None
-
-
-@dataclass(frozen=True)
-class GroupFacts:
-    """Joints that share a rhythm.
-
-    Attributes:
-        joints: Names of the driven joints that have it, head to tail.
-        windows: Whole cycles of it at the end of the fitted stretch.
-        wave: As in :class:`GaitFacts`.
-        lag_per_joint_rad: As in :class:`GaitFacts`.
-        trend: How the responses change over the fitted window: ``steady``, ``drifting`` or
-            ``settling``; None where it is unknown.
-        time_constant_s: Of the approach to steady values, where the responses settle.
-        oscillation_hz: Frequency by which a transient that rings is off the gait's; None of others.
-        cycle_correlation: Of gain or lag from one cycle to the next, the larger; None where cycles
-            do not vary by more than noise.
-        effective_cycles: How many independent cycles would show the mean as well, where they vary;
-            below 4 intervals may be too narrow.
-        frequency_drift_hz_per_s: Of the commands; empty where their frequency stays.
-        amplitude_drift_per_cycle: Of the commands, relative; empty where it stays.
-    """
-
-    frequency_hz: Estimate
-    joints: tuple[str, ...]
-    windows: tuple[Window, ...] = ()
-    wave: str | None = None
-    lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
-    trend: str | None = None
-    time_constant_s: Estimate = field(default_factory=Estimate)
-    oscillation_hz: float | None = None
-    cycle_correlation: float | None = None
-    effective_cycles: float | None = None
-    frequency_drift_hz_per_s: Estimate = field(default_factory=Estimate)
-    amplitude_drift_per_cycle: Estimate = field(default_factory=Estimate)
-
-
-@dataclass(frozen=True)
-class GaitFacts:
-    """The rhythm that was found; where joints have several, that of the largest group.
-
-    Attributes:
-        frequency_hz: Gait frequency with interval; value None where there is no gait.
-        windows: What was analysed: energies, coverage and body motion are taken over these whole
-            cycles (0 cycles where there is no gait).
-        wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
-        lag_per_joint_rad: Commanded phase step from joint to joint, by plane.
-        fitted: The stretch whose samples gain, lag and frequency are fitted to: the windows and
-            the part of a cycle that is left over; None where there is no gait.
-        groups: Joints by frequency, the largest group first, which the values above are of; one
-            group where all driven joints share a frequency, none where there is no gait.
-    """
-
-    frequency_hz: Estimate
-    windows: tuple[Window, ...] = ()
-    wave: str | None = None
-    lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
-    fitted: Window | None = None
-    groups: tuple[GroupFacts, ...] = ()
-
-
-@dataclass(frozen=True)
-class JointInWindow:
-    """One joint's response in one window of a constant gait.
-
-    Attributes:
-        joint: Name.
-        command_amplitude_rad: Amplitude of the command.
-        gain: Amplitude of the response over that of the command.
-        lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
-    """
-
-    joint: str
-    command_amplitude_rad: float | None
-    gain: Estimate
-    lag_rad: Estimate
-
-
-@dataclass(frozen=True)
-class GaitWindow:
-    """One gait of a session whose gait changes.
-
-    Attributes:
-        start_s: Start of its window, from the session's start [s].
-        stop_s: End [s].
-        cycles: Periods in it.
-        frequency_hz: Frequency of its largest group of joints.
-        wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
-        joints: In chain order.
-    """
-
-    start_s: float
-    stop_s: float
-    cycles: float
-    frequency_hz: Estimate
-    wave: str | None
-    joints: tuple[JointInWindow, ...]
-
-
-@dataclass(frozen=True)
-class JointResult:
-    """One joint's response to its command.
-
-    Attributes:
-        plane: ``horizontal``, ``vertical`` or None where no robot description says.
-        command_amplitude_rad: Amplitude of the command at the frequency of its group.
-        gain: Amplitude of the response over that of the command.
-        lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
-        energy_net_j: Integral of torque times velocity.
-        energy_plus_j: Its positive part only.
-        energy_el_j: Electrical energy at the motor, integral of u V i (signed).
-        energy_el_clipped_j: Its positive part only (no regeneration).
-        coverage: Fraction of the windows that has samples, 0 to 1.
-        flags: Artefacts seen in the analysed stretch, e.g. ``saturated``;
-            :attr:`Analysis.artefacts` says when.
-        group: Index of the joint's group in :attr:`GaitFacts.groups`, 0 is the largest; None
-            where the gait does not drive it.
-        frequency_hz: Frequency of that group, at which gain and lag are given; or None.
-        dead_band: Stick or play at the reversals, or None where none can be measured.
-        gain_drift_per_cycle: Relative change of the gain, mean over the window, where it drifts;
-            gain and lag are then means over the window.
-        lag_drift_rad_per_cycle: The same of the lag.
-        gain_transient: Relative deviation of the gain from its steady value at the start of the
-            window, where the response settles; gain and lag are then the steady values.
-        lag_transient_rad: The same of the lag.
-        gain_cycle_sd: Standard deviation of the relative gain from cycle to cycle beyond noise;
-            None where there is none.
-        lag_cycle_sd_rad: The same of the lag.
-        offset_rad: Mean of the response less that of the command; :attr:`Analysis.tracking` has
-            it of joints that the gait does not drive.
-        command_mean_rad: Mean of the command over the fitted window.
-    """
-
-    name: str
-    plane: str | None
-    command_amplitude_rad: float | None
-    gain: Estimate
-    lag_rad: Estimate
-    energy_net_j: float | None
-    energy_plus_j: float | None
-    energy_abs_j: float | None
-    energy_el_j: float | None
-    energy_el_clipped_j: float | None
-    coverage: float
-    samples: int
-    flags: tuple[str, ...] = ()
-    group: int | None = None
-    frequency_hz: float | None = None
-    dead_band: DeadBand | None = None
-    gain_drift_per_cycle: Estimate = field(default_factory=Estimate)
-    lag_drift_rad_per_cycle: Estimate = field(default_factory=Estimate)
-    gain_transient: Estimate = field(default_factory=Estimate)
-    lag_transient_rad: Estimate = field(default_factory=Estimate)
-    gain_cycle_sd: float | None = None
-    lag_cycle_sd_rad: float | None = None
-    offset_rad: Estimate = field(default_factory=Estimate)
-    command_mean_rad: float | None = None
-
-
-@dataclass(frozen=True)
-class Index(WithInterval):
-    """One heterogeneity index, in ``unit``.
-
-    Attributes:
-        p: p-value of the index's null, or None where no test belongs to it.
-        unit: SI unit, or ``1``.
-        label: What it measures, in a few words.
-    """
-
-    p: float | None = None
-    unit: str = "1"
-    label: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

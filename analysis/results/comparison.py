@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from . import formats
+from ..common import formats
+from ..common.estimate import Estimate, PresentedResult, Provenance, leaves_out_zero
 from .analysis import Analysis, SessionFacts
-from .estimate import Estimate, PresentedResult, Provenance, leaves_out_zero
 
 BODY = "body"
 """Where a difference is that belongs to no joint."""

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from undulog.capture.common.arrays import FloatArray
 
-from .estimate import Estimate, PresentedResult
+from ..common.estimate import Estimate, PresentedResult
 
 LTI_LABEL = (
     "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); the "

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from .analysis import Analysis, Index
-from .body import BodyConnection
+from ..common.estimate import Estimate, PresentedResult, Provenance
+from ..parts.heterogeneity.result import Index
+from .analysis import Analysis
+from .best_linear import BestLinearResponses
+from .body_connection import BodyConnection
 from .coupling import Coupling
-from .estimate import Estimate, PresentedResult, Provenance
-from .frequency_response import BestLinearResponses
 from .oscillators import BodyOscillators
 
 BLIND = (

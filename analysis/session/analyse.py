@@ -10,6 +10,9 @@ from dataclasses import asdict
 from undulog.capture import SessionView
 from undulog.capture.common.extras import base_versions
 
+from ..common.answer import led
+from ..common.estimate import Provenance
+from ..common.remarks import Remarks
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..parts.artefacts.part import ARTEFACTS
@@ -24,7 +27,7 @@ from ..parts.gaits.measure import gait_windows
 from ..parts.gaits.part import GAITS
 from ..parts.ground_contact.part import GROUND_CONTACT
 from ..parts.heterogeneity.part import HETEROGENEITY
-from ..parts.joints.measure import SessionMeasurement, gait_facts
+from ..parts.joints.measure import gait_facts
 from ..parts.joints.part import JOINTS
 from ..parts.judgement.part import JUDGEMENT
 from ..parts.oscillators.part import CLOSED_LOOP, OSCILLATORS
@@ -33,12 +36,11 @@ from ..parts.part import in_order, measure
 from ..parts.tracking.part import TRACKING
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, SessionFacts
-from ..results.answer import Remarks, led
-from ..results.estimate import Provenance
 from ..signals.columns import drag_ratio
 from ..signals.session_signals import read_signals
 from ..signals.stretch import Options
 from .added_parts import added_parts, checked
+from .measurement import SessionMeasurement
 from .parts import PARTS
 from .runs import coupling_of_one_gait
 

@@ -19,12 +19,13 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
+from ..common import formats
+from ..common.answer import distinct
+from ..parts.gait.result import Window
 from ..response.fitting import GaitFit
 from ..response.response import Response
 from ..response.rhythm import phase_step, wave_name
-from ..results import formats
-from ..results.analysis import Analysis, Window
-from ..results.answer import distinct
+from ..results.analysis import Analysis
 from ..results.coupling import Coupling
 from ..signals.columns import by_plane
 

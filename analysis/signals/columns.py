@@ -26,9 +26,9 @@ from undulog.capture.log.read.pauses import without_pauses
 from undulog.capture.log.read.sample_times import LARGEST, MOST_JOINTS, JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
+from ..common.remarks import Lacking, Leading, Note
 from ..estimators.turning import turning_beside_others
 from ..response.rhythm import DRIVEN_SHARE
-from ..results.answer import Lacking, Leading, Note
 
 DRAG_RATIO = 10.0
 """K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""

@@ -11,8 +11,8 @@ from undulog.capture.common.console import Warn
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.robot.model import Robot
 
+from ..common.remarks import Note, Remarks
 from ..estimators.series import Series
-from ..results.answer import Note, Remarks
 from .columns import Columns, read_columns
 from .stretch import (
     Choice,

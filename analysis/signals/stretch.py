@@ -15,10 +15,10 @@ from undulog.capture.common.errors import DataError, LogError, UsageError
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
+from ..common.remarks import Leading, Note
 from ..estimators.series import Series, clean, clean_together
 from ..response.groups import find_groups
 from ..response.rhythm import MIN_CYCLES, MIN_EXPLAINED
-from ..results.answer import Leading, Note
 from .columns import QUANTITIES, Columns
 from .gait_windows import several_gaits
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.results.analysis import Analysis, GaitFacts, GroupFacts
-from undulog.analysis.results.formats import utc
+from undulog.analysis.common.formats import utc
+from undulog.analysis.parts.gait.result import GaitFacts, GroupFacts
+from undulog.analysis.results.analysis import Analysis
 from undulog.capture import SessionView
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import DataError

@@ -16,8 +16,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from undulog.analysis.common.formats import number
 from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.formats import number
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors, scale_ends
 

@@ -26,10 +26,11 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from undulog.analysis.parts.over_time.measure import LEAST_COVERED, CycleMaps
-from undulog.analysis.results.analysis import Analysis, JointResult
-from undulog.analysis.results.cycles import JointOverTime
-from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.parts.joints.result import JointResult
+from undulog.analysis.parts.over_time.result import JointOverTime
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.session.cycle_maps import LEAST_COVERED, CycleMaps
 from undulog.capture.common.arrays import FloatArray, IntArray
 
 from ..samples.content import (

@@ -16,7 +16,8 @@ import rerun as rr
 
 from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, LoggedPhase, demodulate, weigh
 from undulog.analysis.estimators.series import Series, clean
-from undulog.analysis.parts.over_time.measure import LEAST_COVERED, LoggedGait
+from undulog.analysis.parts.over_time.measure import LoggedGait
+from undulog.analysis.session.cycle_maps import LEAST_COVERED
 from undulog.analysis.signals.columns import planes_of
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot

@@ -25,11 +25,11 @@ import numpy as np
 import rerun as rr
 from rerun.components import FillMode
 
+from undulog.analysis.common.estimate import Estimate
 from undulog.analysis.compare.quantities import Known
 from undulog.analysis.compare.side import ComparedSession
 from undulog.analysis.estimators.intervals import around, t_factor
 from undulog.analysis.results.comparison import BODY, Comparison
-from undulog.analysis.results.estimate import Estimate
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 

@@ -9,8 +9,8 @@ from typing import Any, cast
 import rerun.blueprint as rrb
 from rerun.encodings import EntityPathLike
 
+from undulog.analysis.common.formats import short, utc
 from undulog.analysis.results.comparison import Comparison, MetadataChange
-from undulog.analysis.results.formats import short, utc
 
 from ..draw import lines
 from ..draw import stage as ranges

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from undulog.analysis.parts.over_time.measure import CycleMaps
     from undulog.analysis.results.analysis import Analysis
+    from undulog.analysis.session.cycle_maps import CycleMaps
     from undulog.capture.common.arrays import FloatArray
     from undulog.capture.robot.model import Plane, Robot
 
@@ -155,7 +155,7 @@ class HeatMap:
     @property
     def ends(self) -> tuple[str, str]:
         """The range of the colours in words."""
-        from undulog.analysis.results.formats import decimals_for_values, number
+        from undulog.analysis.common.formats import decimals_for_values, number
 
         digits = decimals_for_values([self.low, self.high], 3)
         return number(self.low, digits), number(self.high, digits)

@@ -23,8 +23,8 @@ from typing import Any
 
 import tomlkit
 
+from undulog.analysis.common.estimate import Interval
 from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.estimate import Interval
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session

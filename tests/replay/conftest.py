@@ -11,9 +11,10 @@ import pytest
 from support import processes
 from support.built_results import around, passive_joint
 from support.written_topics import EPOCH_NS, GAIT, write_topics
-from undulog.analysis.results.analysis import Analysis, GaitFacts, SessionFacts, Window
+from undulog.analysis.common.estimate import Provenance
+from undulog.analysis.parts.gait.result import GaitFacts, Window
+from undulog.analysis.results.analysis import Analysis, SessionFacts
 from undulog.analysis.results.coupling import Coupling
-from undulog.analysis.results.estimate import Provenance
 from undulog.capture import Session, load_robot
 from undulog.capture.robot.model import Plane
 

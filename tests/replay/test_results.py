@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from undulog.analysis.common.estimate import Estimate, Provenance
 from undulog.analysis.results.comparison import (
     Comparison,
     ModelledAnalysis,
@@ -13,7 +14,6 @@ from undulog.analysis.results.comparison import (
     NullModelResult,
 )
 from undulog.analysis.results.coupling import Coupling
-from undulog.analysis.results.estimate import Estimate, Provenance
 from undulog.analysis.results.experiment import (
     Experiment,
     FloorTilt,

@@ -3,21 +3,15 @@
 import dataclasses
 import math
 
+from undulog.analysis.common.answer import Shape
+from undulog.analysis.common.estimate import Estimate, Provenance
 from undulog.analysis.parts.comparison.answer import Facts, compose
 from undulog.analysis.parts.comparison.examine import Findings
-from undulog.analysis.results.analysis import (
-    Analysis,
-    BodyPoint,
-    BodyResult,
-    GaitFacts,
-    Index,
-    JointResult,
-    SessionFacts,
-    Window,
-)
-from undulog.analysis.results.answer import Shape
+from undulog.analysis.parts.gait.result import GaitFacts, Window
+from undulog.analysis.parts.heterogeneity.result import Index
+from undulog.analysis.parts.joints.result import JointResult
+from undulog.analysis.results.analysis import Analysis, BodyPoint, BodyResult, SessionFacts
 from undulog.analysis.results.coupling import Coupling
-from undulog.analysis.results.estimate import Estimate, Provenance
 
 
 def answered(analysis, shape=()):

@@ -14,7 +14,7 @@ from typing import cast
 
 import numpy as np
 
-from undulog.analysis.results.answer import Verdict
+from undulog.analysis.common.answer import Verdict
 from undulog.analysis.session.analyse import measure_session
 from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError

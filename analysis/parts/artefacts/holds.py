@@ -13,8 +13,8 @@ from scipy.special import bdtrc
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ...estimators.series import Series
-from ...results.answer import Span
-from ...signals.scales import resolution_of, runs, spans_of, turns
+from .result import Span
+from .scales import resolution_of, runs, spans_of, turns
 
 FROZEN_TRAVEL = 0.29
 """Travel of the command during a hold, as a share of its range: what it has in a quarter of a

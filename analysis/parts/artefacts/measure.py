@@ -1,7 +1,7 @@
 """All artefacts of a session: every detector on every joint that it applies to.
 
 A frozen encoder is not a weak servo: what is wrong with samples, or at a limit, is kept apart from
-mechanics. Each :class:`~.analysis.results.answer.Artefact` names a joint, a topic and the intervals
+mechanics. Each :class:`~.analysis.common.answer.Artefact` names a joint, a topic and the intervals
 in which it holds, and states what it is about: the ``sensor`` (the values are not what the joint
 did), the ``record`` (samples are missing) or a ``limit`` (the robot could not do more; the values
 are right).
@@ -31,9 +31,10 @@ from undulog.capture.judgement.response import Filtered, fit_response
 from undulog.capture.log.read.sample_times import LARGEST, Signal
 
 from ...estimators.series import Series, clean_together
-from ...results.answer import FALSIFYING, Artefact, Span
 from ...signals.columns import QUANTITIES, Columns
-from ...signals.scales import (
+from .holds import clipped, frozen, stale
+from .result import FALSIFYING, Artefact, Span
+from .scales import (
     SAME_RATE,
     SAME_SCALE,
     against_command,
@@ -45,7 +46,6 @@ from ...signals.scales import (
     spans_of,
     turns,
 )
-from .holds import clipped, frozen, stale
 
 ABOVE_NEIGHBOURS = 8.0
 """A step this many times those beside it stands alone."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ...common.remarks import Remarks
 from ...estimators.series import Series
-from ...results.answer import Artefact, Remarks
 from ...signals.session_signals import Signals
-from ..judgement.measure import (
-    unrefuted,
-)
 from ..judgement.part import JUDGEMENT
 from ..part import Part, Results
 from .measure import find_artefacts
+from .refuted import unrefuted
+from .result import Artefact
 
 
 @dataclass(frozen=True)

@@ -15,18 +15,18 @@ from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
+from ...common.estimate import Estimate
+from ...common.remarks import Note
 from ...estimators.harmonic import HarmonicFit, HarmonicModel, fit_at
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series
 from ...estimators.spectrum import residual_noise
 from ...response.fitting import GaitFit
 from ...response.rhythm import allowed_model
-from ...results.answer import Note
-from ...results.body import BodyPoint, BodyResult
-from ...results.estimate import Estimate
 from ...signals.columns import DRAG_RATIO, by_plane, drag_ratio
 from ...signals.windows import Span
 from .null import free_chain, one_cycle, places, viscous_chain
+from .result import BodyPoint, BodyResult
 
 PLACES = ("head", "middle", "tail")
 TREND = 2

@@ -18,12 +18,12 @@ from scipy.special import fdtri
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
+from ...common.estimate import Estimate, Interval
 from ...estimators.harmonic import HarmonicFit, fit_at
 from ...estimators.intervals import CONFIDENCE, around, t_factor
 from ...estimators.series import Series
 from ...estimators.spectrum import ResidualBins, residual_spectrum
 from ...response.fitting import GaitFit
-from ...results.estimate import Estimate, Interval
 
 _GRID = 16
 """Trial wave numbers for each joint; the peak's width is one over the number of joints."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from ...results.answer import Remarks
-from ...results.body import BodyResult
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT
 from ..part import Part, Results
 from .motion import body_motion
+from .result import BodyResult
 from .shape import MeasuredShape, body_shape
 
 

@@ -19,17 +19,17 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.model import Plane, Robot
 
+from ...common.estimate import Estimate
+from ...common.formats import scaled
+from ...common.remarks import Note
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series
 from ...response.fitting import GaitFit
-from ...results.answer import Note
-from ...results.body import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
-from ...results.estimate import Estimate
-from ...results.formats import scaled
 from ...signals.columns import by_plane
 from ...signals.windows import Span
 from .motion import ODOMETRY_TOPIC, head_poses
 from .oscillation import MotionFit, Oscillation, absolute, best_lag, fit_motion, wave_speed
+from .result import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
 from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles, mean_step
 
 LEAST_JOINTS = 4

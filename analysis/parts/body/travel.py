@@ -22,11 +22,11 @@ from undulog.capture.common.errors import DataError, LogError
 from undulog.capture.robot.kinematics import link_positions, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
+from ...common.estimate import Estimate
 from ...estimators.harmonic import HarmonicModel, fit_at
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series
 from ...response.rhythm import NYQUIST_SHARE
-from ...results.estimate import Estimate
 from ...signals.windows import Span
 from .motion import ODOMETRY_TOPIC, Poses, head_poses, link_centres
 from .null import SAMPLES, travel

@@ -18,16 +18,17 @@ from undulog.capture.judgement.fault import NOTHING, Apart, Judgement, clause_of
 from undulog.capture.judgement.levels import FOLLOWS, QUARTER
 from undulog.capture.judgement.naming import NAMED
 
-from ...results import formats
-from ...results.analysis import GaitFacts, Index, JointResult
-from ...results.answer import Answer, Artefact, NotFollowing, Shape, StandOut, Verdict
-from ...results.estimate import Estimate
-from ...results.frequency_response import (
-    BodyWave,
-    FreeMotion,
-    JointFrequencyResponse,
-    JointTracking,
-)
+from ...common import formats
+from ...common.answer import Answer, NotFollowing, Shape, StandOut, Verdict
+from ...common.estimate import Estimate
+from ..artefacts.result import Artefact
+from ..free_motion.result import BodyWave, FreeMotion
+from ..frequency_response.result import JointFrequencyResponse
+from ..gait.result import GaitFacts
+from ..gait.show import gait_frequency
+from ..heterogeneity.result import Index
+from ..joints.result import JointResult
+from ..tracking.result import JointTracking
 from .examine import Findings
 from .words import (
     deviation_in_words,
@@ -292,7 +293,7 @@ def _motion(facts: Facts, motion: FreeMotion) -> str:
     """Return the sentence on a motion without commands."""
     if not motion.joints:
         return "No command logged, and no single frequency in the motion."
-    gait = formats.gait_frequency(facts.gait)
+    gait = gait_frequency(facts.gait)
     lead = f"No command logged; the motion has {gait} and an amplitude"
     whole = [wave for wave in motion.waves if wave.standing or wave.direction != "undecided"]
     if not whole or len(motion.joints) <= NAMED:
@@ -447,7 +448,7 @@ def _responding(facts: Facts, results: Sequence[JointResult]) -> str:
     """How many joints respond, to which gait, and the range of their lags."""
     if facts.gait.frequency_hz.value is None:
         return _why_not(facts, "no gait")
-    frequency = formats.gait_frequency(facts.gait)
+    frequency = gait_frequency(facts.gait)
     silent = {fault.joint for fault in facts.not_following}
     responding = [joint for joint in results if joint.name not in silent]
     text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"

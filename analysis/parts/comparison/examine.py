@@ -12,9 +12,9 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 from undulog.capture.judgement.levels import reaches
 
+from ...common.answer import Shape, StandOut
 from ...estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ...response.response import Response
-from ...results.answer import Shape, StandOut
 from .kinds import Split, split_of
 from .outliers import LOCAL, Deviation, standing_out
 from .profile import (

@@ -7,10 +7,10 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
+from ...common.answer import NotFollowing
 from ...response.fitting import GaitFit
-from ...results.analysis import JointResult
-from ...results.answer import NotFollowing
 from ...signals.columns import by_plane
+from ..joints.result import JointResult
 from ..judgement.measure import stopped
 from .examine import Chain, Findings, examine
 from .pooled import over_gaits

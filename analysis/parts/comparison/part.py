@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..gait.part import GAIT
 from ..gaits.part import GAITS

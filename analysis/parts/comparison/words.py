@@ -10,10 +10,10 @@ from undulog.capture.judgement.fault import RestsOff, clause_of
 from undulog.capture.judgement.levels import HALF, LARGEST_REST_RAD
 from undulog.capture.judgement.naming import NAMED
 
-from ...results import formats
-from ...results.answer import NotFollowing, StandOut
-from ...results.estimate import Estimate, Interval
-from ...results.frequency_response import JointTracking
+from ...common import formats
+from ...common.answer import NotFollowing, StandOut
+from ...common.estimate import Estimate, Interval
+from ..tracking.result import JointTracking
 
 LOW_GAIN = 0.85
 """Gain below which a joint is named though there is nothing to compare it with: hobby servos that

@@ -12,11 +12,11 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
 from ...estimators.series import Series, clean_together, shared_times
 from ...response.fitting import GaitFit
-from ...results.answer import EITHER, PLAY, STICK, DeadBand, DeadBandEnd
 from ...signals.columns import Columns
-from ...signals.scales import resolution_of, runs
+from ..artefacts.scales import resolution_of, runs
 from .fit import FittedBand, fit_dead_bands
 from .model import BOTTOM, DELAY, TOP, WIDTH, WholeCycles, whole_cycles
+from .result import EITHER, PLAY, STICK, DeadBand, DeadBandEnd
 
 _RAMP = 0.5
 """Change of the effort over a plateau that is a ramp, as a share of the effort in motion."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...results.answer import DeadBand, Remarks
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT
@@ -14,6 +14,7 @@ from ..judgement.measure import (
 from ..judgement.part import JUDGEMENT
 from ..part import Part, Results
 from .measure import dead_bands
+from .result import DeadBand
 
 
 def _dead_bands(signals: Signals, done: Results, remarks: Remarks) -> Mapping[str, DeadBand]:

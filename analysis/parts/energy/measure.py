@@ -27,15 +27,16 @@ from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
+from ...common.estimate import Estimate
+from ...common.remarks import Note
 from ...estimators.demodulation import Weighed, cycle_sums, weigh
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series, clean
-from ...results.answer import Artefact, Note
-from ...results.cycles import Closure, Each, EnergyResult, JointCycles, Transport
-from ...results.estimate import Estimate
 from ...signals.columns import Columns
 from ...signals.windows import Span
+from ..artefacts.result import Artefact
 from ..body.travel import GRAVITY, body_steps
+from .result import Closure, Each, EnergyResult, JointCycles, Transport
 
 TERMS = {
     "net": ("mechanical", "net_j", "mechanical_net"),

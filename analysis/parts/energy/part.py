@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ...results.answer import Remarks
-from ...results.cycles import Closure, EnergyResult
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT
 from ..part import Part, Results
 from .measure import Energies, check_ledger, energy_result, joint_energies, transport
+from .result import Closure, EnergyResult
 
 
 @dataclass(frozen=True)

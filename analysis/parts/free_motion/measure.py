@@ -12,11 +12,10 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.judgement.levels import ANGLE_MARGIN_RAD
 from undulog.capture.robot.model import Robot
 
+from ...common.estimate import Estimate
 from ...estimators.harmonic import HarmonicFit
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series
-from ...results.estimate import Estimate
-from ...results.frequency_response import BodyWave, FreeMotion, JointMotion, LocalWaveNumber
 from ...signals.columns import by_plane
 from ..body.oscillation import (
     MotionFit,
@@ -29,6 +28,7 @@ from ..body.oscillation import (
     travelling_index,
     wave_speed,
 )
+from .result import BodyWave, FreeMotion, JointMotion, LocalWaveNumber
 
 
 def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tuple[str, ...]]:

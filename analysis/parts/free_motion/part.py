@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ...results.answer import Note, Remarks
-from ...results.frequency_response import FreeMotion
+from ...common.remarks import Note, Remarks
 from ...signals.session_signals import Signals
 from ..body.part import BODY
 from ..part import Part, Results
 from .measure import free_motion
+from .result import FreeMotion
 
 UNDECIDED_ENDS = (
     "without a robot description the order of the joints is that of the record, and which end is "

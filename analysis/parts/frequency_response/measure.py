@@ -14,9 +14,8 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.process import in_threads
 
+from ...common.estimate import Estimate, Interval
 from ...estimators.series import Series, moves
-from ...results.estimate import Estimate, Interval
-from ...results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
 from .excitation import Excitation, ExcitationKind, excited_bins, find_excitation, swept_band
 from .nonparametric import (
@@ -31,6 +30,7 @@ from .nonparametric import (
     tone_response,
     window,
 )
+from .result import DIRECT, INDIRECT, JointFrequencyResponse
 
 if TYPE_CHECKING:
     pass

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
-from ...results.frequency_response import JointFrequencyResponse
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ...signals.stretch import series_in
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT
 from ..part import Part, Results
 from .measure import frequency_responses
+from .result import JointFrequencyResponse
 
 
 def _frequency_response(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...common.remarks import Note, Remarks
 from ...response.fitting import GaitFit, fit_at_period, fit_gait
-from ...results.answer import Note, Remarks
 from ...signals.session_signals import Signals
 from ...signals.windows import Span, Stretch, whole_cycles
 from ..artefacts.part import ARTEFACTS

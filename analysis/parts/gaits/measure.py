@@ -9,15 +9,16 @@ import numpy as np
 
 from undulog.capture.robot.model import Robot
 
+from ...common.estimate import Estimate
+from ...common.remarks import Remarks
 from ...estimators.intervals import around, t_factor
 from ...response.fitting import GaitFit, fit_gait
-from ...results.analysis import GaitWindow, JointInWindow
-from ...results.answer import Artefact, Remarks
-from ...results.estimate import Estimate
 from ...signals.columns import Columns
 from ...signals.stretch import Choice, series_in
 from ...signals.windows import Stretch
+from ..artefacts.result import Artefact
 from ..joints.measure import main_wave, response_estimates
+from .result import GaitWindow, JointInWindow
 
 MOST_GAITS = 16
 """Windows that are fitted, the longest ones: an hour in which the gait changes each minute is

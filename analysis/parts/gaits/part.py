@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT

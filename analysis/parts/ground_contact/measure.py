@@ -25,15 +25,15 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Plane, Robot
 
+from ...common.remarks import Note
 from ...estimators.nonnegative import nonnegative_least_squares
 from ...estimators.series import Series, clean
-from ...results.answer import Note
-from ...results.body import GroundContact, LinkContact
 from ...signals.columns import Columns
 from ...signals.stretch import SharedTimes, part_of
 from ...signals.windows import Span
 from ..body.motion import ODOMETRY_TOPIC, head_poses
 from ..body.travel import GRAVITY, MIN_CYCLES, mean_step
+from .result import GroundContact, LinkContact
 
 PHASES = 32
 """Parts of a cycle, over each of which angles and torques are averaged."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
-from ...results.body import GroundContact
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..gait.part import GAIT
 from ..part import Part, Results
 from .measure import ground_contact
+from .result import GroundContact
 
 
 def _ground_contact(signals: Signals, done: Results, remarks: Remarks) -> GroundContact | None:

@@ -20,6 +20,8 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.robot.model import Robot
 
+from ...common.estimate import Interval
+from ...common.remarks import Note
 from ...estimators.intervals import (
     CONFIDENCE,
     EQUIVALENT_GAIN,
@@ -30,11 +32,10 @@ from ...estimators.intervals import (
 )
 from ...response.fitting import GaitFit
 from ...response.response import Response
-from ...results.analysis import Index, JointResult
-from ...results.answer import Note
-from ...results.estimate import Interval
 from ...signals.columns import by_plane
 from ..energy.measure import Energies
+from ..joints.result import JointResult
+from .result import Index
 
 ENDS = 2
 MIDDLE = 5

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from ...results.analysis import Index
-from ...results.answer import Remarks
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..energy.part import ENERGIES
 from ..gait.part import GAIT
 from ..joints.part import JOINTS
 from ..part import Part, Results
 from .measure import heterogeneity_indices
+from .result import Index
 
 
 def _heterogeneity(signals: Signals, done: Results, remarks: Remarks) -> dict[str, Index]:

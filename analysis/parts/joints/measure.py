@@ -4,55 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import NS, FloatArray
+from undulog.capture.common.arrays import NS
 from undulog.capture.robot.model import Robot
 
+from ...common.estimate import Estimate
 from ...estimators.intervals import around, t_factor
 from ...estimators.series import Series, coverage
 from ...estimators.trends import Trend
 from ...response.fitting import GaitFit
 from ...response.response import gain_estimate, lag_estimate
 from ...response.rhythm import phase_step, wave_name
-from ...results.analysis import Analysis, GaitFacts, GroupFacts, JointResult, Window
-from ...results.answer import DeadBand
-from ...results.estimate import Estimate
 from ...signals.columns import Columns, by_plane, planes_of
 from ...signals.windows import Span, Stretch, whole_cycles
-from ..body.oscillation import MotionFit
-from ..body.travel import GaitCycle
+from ..dead_band.result import DeadBand
 from ..energy.measure import GAP_SHARE, TERMS, Energies
+from ..gait.result import GaitFacts, GroupFacts, Window
 from ..tracking.gait import GaitOffset
-
-
-@dataclass(frozen=True)
-class SessionMeasurement:
-    """One session's numbers with what they were computed from; heavy, so not to be kept.
-
-    Attributes:
-        gait: The fitted gait, or None.
-        responses: Measured joint angles by name, on the analysed stretch.
-        span: Whole cycles over which energies are taken.
-        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
-        motion: The periodic motion of a session without commands, or None.
-        cycle: One cycle of shape and motion of the body, where its pose is known, or None.
-        gait_offsets: Of the joints that the gait drives, by name.
-    """
-
-    analysis: Analysis
-    gait: GaitFit | None
-    responses: Mapping[str, Series]
-    energies: Mapping[str, Energies]
-    span: Span
-    offsets: Mapping[str, FloatArray]
-    motion: MotionFit | None = None
-    cycle: GaitCycle | None = None
-    gait_offsets: Mapping[str, GaitOffset] = field(default_factory=dict[str, GaitOffset])
+from .result import JointResult
 
 
 def gait_facts(

@@ -6,17 +6,18 @@ from collections.abc import Iterable
 
 from undulog.capture.common.console import Warn
 
+from ...common.remarks import Remarks
 from ...response.fitting import GaitFit
-from ...results.analysis import JointResult
-from ...results.answer import KINDS, Artefact, Remarks, flags_by_joint
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
+from ..artefacts.result import KINDS, Artefact, flags_by_joint
 from ..dead_band.part import DEAD_BAND
 from ..energy.part import ENERGIES
 from ..gait.part import GAIT
 from ..part import Part, Results
 from ..tracking.part import TRACKING
 from .measure import joint_results
+from .result import JointResult
 
 
 def _joints(signals: Signals, done: Results, remarks: Remarks) -> tuple[JointResult, ...]:

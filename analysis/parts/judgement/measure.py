@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,18 +14,12 @@ from undulog.capture.judgement.judge import judge
 from undulog.capture.judgement.motion import RecordedJoint, cycle_s
 from undulog.capture.judgement.session import motions_of, times_made
 
-from ...results.answer import Artefact, NotFollowing, overlapping
+from ...common.answer import NotFollowing
 from ...signals.columns import QUANTITIES, Columns
 from ...signals.windows import Stretch
 
 _COMPARABLE = {"lost_samples"}
 """A joint with these faults alone still takes part in the comparison."""
-
-_STANDING = frozenset({("position", "frozen"), ("position", "clipped"), ("effort", "stalled")})
-"""Artefacts of a joint that stands; whether it had to move decides."""
-
-_REPEATED = _STANDING | {("position", "stale")}
-"""Artefacts that frames of made times show of what is sampled more slowly."""
 
 
 @dataclass(frozen=True)
@@ -71,36 +65,6 @@ def _offsets(motion: RecordedJoint) -> FloatArray:
     error = np.concatenate([[0.0], np.cumsum(motion.position.values - command)])
     samples = np.diff(edges)
     return (np.diff(error[edges]) / np.maximum(samples, 1))[samples > 0]
-
-
-def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefact, ...]:
-    """Leave out values that seem to stand where the joint follows its command all the same.
-
-    A joint that was not asked to move may stand, too; of one that doesn't follow for a while, what
-    stands at other times is left out.
-
-    Args:
-        follows: How the joints follow.
-
-    Returns:
-        The others, in their order.
-    """
-    judgement = follows.judgement
-    standing = _REPEATED if follows.in_frames else _STANDING
-    decided = bool(judgement.judged or judgement.unexposed or follows.in_frames)
-    faults = {fault.joint: fault.spans_s for fault in judgement.faults}
-    left: list[Artefact] = []
-    for artefact in artefacts:
-        if (artefact.quantity, artefact.flag) not in standing:
-            left.append(artefact)
-        elif artefact.joint in faults:
-            spans = [
-                span for span in artefact.spans_s if overlapping(faults[artefact.joint], *span)
-            ]
-            left += [replace(artefact, spans_s=tuple(spans))] if spans else []
-        elif not (decided and artefact.joint in follows.commanded):
-            left.append(artefact)
-    return tuple(left)
 
 
 def not_following(follows: Following) -> tuple[NotFollowing, ...]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...results.answer import NotFollowing, Remarks
+from ...common.answer import NotFollowing
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..part import Part, Results
 from .measure import Following, following, not_following

@@ -19,12 +19,13 @@ from undulog.capture.common.arrays import NS, BoolArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 
+from ...common.answer import beyond, percent
+from ...common.estimate import Estimate, leaves_out_zero
+from ...common.remarks import Note
 from ...estimators.intervals import CONFIDENCE, around, t_factor
-from ...results.answer import Note, beyond, percent
-from ...results.estimate import Estimate, leaves_out_zero
-from ...results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
-from ...results.oscillators import ChainCoupling, OscillatorLink, Rate
 from ...signals.stretch import GAIT_TOPIC, Options
+from ..frequency_response.result import DIRECT, INDIRECT, JointFrequencyResponse
+from .result import ChainCoupling, OscillatorLink, Rate
 from .weak_form import KickInterval, OscillatorFit, fit_oscillator, read_phases, window_length
 
 LEAST_KICK = 0.1

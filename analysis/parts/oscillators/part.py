@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
-from ...results.oscillators import ChainCoupling
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..frequency_response.part import FREQUENCY_RESPONSE
 from ..part import Part, Results
 from .measure import closed_loop, session_couplings
+from .result import ChainCoupling
 
 
 def _closed_loop(signals: Signals, done: Results, remarks: Remarks) -> str | None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ...results.answer import Remarks
-from ...results.cycles import ResponseOverTime
+from ...common.remarks import Remarks
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
 from ..part import Part, Results
 from .measure import response_over_time
+from .result import ResponseOverTime
 
 
 def _over_time(signals: Signals, done: Results, remarks: Remarks) -> ResponseOverTime | None:

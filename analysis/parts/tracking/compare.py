@@ -29,7 +29,7 @@ from undulog.capture.judgement.levels import (
     reaches,
 )
 
-from ...results.answer import StandOut
+from ...common.answer import StandOut
 from .estimate import Tracking
 
 QUANTITIES = ("gain", "delay", "offset")

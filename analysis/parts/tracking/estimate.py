@@ -20,9 +20,9 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.judgement.levels import FEWEST
 
+from ...common.estimate import Estimate
 from ...estimators.intervals import t_factor
 from ...estimators.series import Series
-from ...results.estimate import Estimate
 from .fit import (
     GAIN,
     OFFSET,

@@ -9,12 +9,12 @@ import numpy as np
 
 from undulog.capture.common.process import in_threads
 
+from ...common.answer import StandOut
 from ...estimators.series import Series
-from ...results.answer import StandOut
-from ...results.frequency_response import JointTracking
 from .compare import unlike
 from .estimate import Tracking, track
 from .gait import GaitOffset
+from .result import JointTracking
 
 MOST_JOINTS = 128
 """Joints that are measured at most: each takes some tens of milliseconds."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...results.answer import Remarks
+from ...common.remarks import Remarks
 from ...signals.columns import by_plane
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS

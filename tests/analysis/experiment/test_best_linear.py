@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from undulog.analysis.common.estimate import Estimate
 from undulog.analysis.experiment.best_linear import (
     detection_lines,
     input_inverse,
@@ -11,7 +12,6 @@ from undulog.analysis.experiment.best_linear import (
     realisation_response,
 )
 from undulog.analysis.parts.frequency_response.nonparametric import line_power
-from undulog.analysis.results.estimate import Estimate
 
 N = 512
 ODD = np.arange(1, 120, 2)

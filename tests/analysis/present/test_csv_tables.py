@@ -11,8 +11,8 @@ import pytest
 from support import built_results
 from support.joint_runs import write_joints
 from undulog.analysis import load
+from undulog.analysis.parts.gait.result import Window
 from undulog.analysis.present.data_frames import write_csv
-from undulog.analysis.results.analysis import Window
 from undulog.capture.common.errors import OutputExistsError, UsageError
 
 NAMES = ("j1", "j2", "j3")

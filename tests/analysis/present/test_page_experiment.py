@@ -8,16 +8,16 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.common.formats import sentence
+from undulog.analysis.parts.artefacts.result import Artefact
 from undulog.analysis.present import page_tables as typeset
 from undulog.analysis.present.experiment_view import profiles
 from undulog.analysis.present.matrix import Entries, entries_of, matrix_picture
 from undulog.analysis.present.page import render
 from undulog.analysis.present.page_tables import experiment_trials, session_trials
 from undulog.analysis.present.session_view import artefact_rows, times_text
-from undulog.analysis.results.answer import Artefact
-from undulog.analysis.results.body import BodyConnection, PredictedTravel
-from undulog.analysis.results.estimate import Estimate
-from undulog.analysis.results.formats import sentence
+from undulog.analysis.results.body_connection import BodyConnection, PredictedTravel
 
 pytestmark = pytest.mark.nightly
 

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
+from undulog.analysis.common.formats import degrees, estimate
 from undulog.analysis.present.page import render
-from undulog.analysis.results.formats import degrees, estimate
 
 pytestmark = pytest.mark.nightly
 

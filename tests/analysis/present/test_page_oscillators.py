@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from undulog.analysis import Estimate
+from undulog.analysis.parts.oscillators.result import ChainCoupling, OscillatorLink, Rate
 from undulog.analysis.present.oscillators import entrainment_entries
 from undulog.analysis.present.page import render
 from undulog.analysis.present.session_view import chain_view
-from undulog.analysis.results.oscillators import ChainCoupling, OscillatorLink, Rate
 
 pytestmark = pytest.mark.slow
 

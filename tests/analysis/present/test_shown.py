@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from undulog.analysis import Choices, Estimate, Experiment, compare_sessions, load
-from undulog.analysis.results.answer import Artefact
+from undulog.analysis.parts.artefacts.result import Artefact
+from undulog.analysis.parts.oscillators.result import ChainCoupling, OscillatorLink, Rate
 from undulog.analysis.results.coupling import Route
-from undulog.analysis.results.oscillators import ChainCoupling, OscillatorLink, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.common.remarks import Lacking, Note
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.slow_changes import Coefficients, SlowChanges
@@ -22,8 +24,6 @@ from undulog.analysis.response.fitting import (
     fit_gait,
 )
 from undulog.analysis.response.groups import Groups, MixedTone, Unresolved
-from undulog.analysis.results.answer import Lacking, Note
-from undulog.analysis.results.estimate import Estimate
 
 T = np.arange(1000) / 100
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from undulog.analysis.common.remarks import Remarks
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.response.response import gain_estimate, lag_estimate
-from undulog.analysis.results.answer import Remarks
 
 GAIT_HZ, DURATION_S, GAIN, LAG_RAD = 0.5, 30.0, 0.9, 0.3
 

@@ -5,6 +5,8 @@ import pytest
 
 from support.analysed import analysed
 from support.joint_runs import write_joints
+from undulog.analysis.common.answer import Answer, Verdict, led
+from undulog.analysis.common.remarks import Leading, Refusal, Remarks
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.series import Series, moves
 from undulog.analysis.parts.frequency_response.excitation import find_excitation
@@ -12,7 +14,6 @@ from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.response.groups import Groups
 from undulog.analysis.response.rhythm import Rhythm
 from undulog.analysis.response.without_gait import few_cycles, too_seldom, why_no_gait
-from undulog.analysis.results.answer import Answer, Leading, Refusal, Remarks, Verdict, led
 
 T = np.arange(1000) / 100
 NAMES = [f"m{k:02d}" for k in range(6)]

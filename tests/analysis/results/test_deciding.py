@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.analysis.results.answer import beyond, distinct, percent
+from undulog.analysis.common.answer import beyond, distinct, percent
 
 
 @pytest.mark.parametrize(

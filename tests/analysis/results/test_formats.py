@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.analysis.results import formats
-from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.common import formats
+from undulog.analysis.common.estimate import Estimate
 from undulog.capture.common.console import plain
 
 

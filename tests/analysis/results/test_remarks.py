@@ -7,7 +7,7 @@ import pytest
 
 from support.joint_runs import write_joints
 from undulog.analysis import analyse_session
-from undulog.analysis.results.answer import Lacking, Note, Remarks
+from undulog.analysis.common.remarks import Lacking, Note, Remarks
 
 NAMES = tuple(f"j{k}" for k in range(8))
 

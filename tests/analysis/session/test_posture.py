@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.analysis.results.analysis import Window
+from undulog.analysis.parts.gait.result import Window
 from undulog.analysis.session.runs import posture
 from undulog.capture import Session, SessionWriter, load_robot
 

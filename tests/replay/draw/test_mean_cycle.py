@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 import undulog
 from support.twin_chains import chain, wave
-from undulog.analysis.parts.over_time.measure import cycle_maps
-from undulog.analysis.results.answer import Artefact
-from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.parts.artefacts.result import Artefact
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.cycle_maps import cycle_maps
 from undulog.capture import Session
 from undulog.replay.draw.drawing import Sources, clock_of
 from undulog.replay.draw.mean_cycle import Averaged

@@ -6,15 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from undulog.analysis.parts.over_time.measure import CycleMaps
-from undulog.analysis.results.cycles import (
-    EnergyResult,
-    JointCycles,
-    JointOverTime,
-    ResponseOverTime,
-    Transport,
-)
-from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.common.estimate import Estimate
+from undulog.analysis.parts.energy.result import EnergyResult, JointCycles, Transport
+from undulog.analysis.parts.over_time.result import JointOverTime, ResponseOverTime
+from undulog.analysis.session.cycle_maps import CycleMaps
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.body import power_colors

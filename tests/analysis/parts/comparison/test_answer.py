@@ -4,10 +4,11 @@ import dataclasses
 
 import pytest
 
+from undulog.analysis.common.answer import NotFollowing, Shape, StandOut, Verdict
+from undulog.analysis.parts.artefacts.result import Artefact
 from undulog.analysis.parts.comparison.answer import Facts, compose
 from undulog.analysis.parts.comparison.examine import Findings
 from undulog.analysis.parts.comparison.words import kinds_in_words
-from undulog.analysis.results.answer import Artefact, NotFollowing, Shape, StandOut, Verdict
 
 YAW = tuple(f"joint{k:02d}" for k in range(1, 26, 2))
 

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from undulog.analysis.common.estimate import Estimate
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.parts.energy import measure as energy
 from undulog.analysis.parts.energy.measure import Energies, Energy, add_up
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.signals.windows import Span
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.sample_times import JointSignals, Signal

@@ -14,9 +14,9 @@ from support.frozen_records import mutable_dataclasses
 from support.twin_chains import chain
 from support.written_sessions import EPOCH_NS
 from undulog.analysis.estimators.series import clean
+from undulog.analysis.parts.artefacts.result import Artefact
 from undulog.analysis.parts.body.travel import GRAVITY
 from undulog.analysis.parts.energy import measure as energy
-from undulog.analysis.results.answer import Artefact
 from undulog.analysis.signals.columns import read_columns
 from undulog.analysis.signals.windows import Span
 from undulog.capture import Session, SessionWriter, load_robot

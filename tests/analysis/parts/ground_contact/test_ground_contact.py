@@ -8,7 +8,7 @@ import pytest
 
 from undulog.analysis.parts.body.travel import GRAVITY
 from undulog.analysis.parts.ground_contact.measure import TOUCHES, link_loads, means_between
-from undulog.analysis.results.body import TWIN_ACCURACY
+from undulog.analysis.parts.ground_contact.result import TWIN_ACCURACY
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane

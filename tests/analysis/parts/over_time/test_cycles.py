@@ -5,8 +5,8 @@ import pytest
 
 from support.joint_runs import write_joints
 from undulog.analysis.estimators.demodulation import amplitudes, starts_of
-from undulog.analysis.parts.over_time.measure import cycle_maps
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.cycle_maps import cycle_maps
 from undulog.capture import Session
 
 NAMES = ("a", "b", "c")

@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 
 from undulog.capture.common.console import plain
 
-from .analysis import GaitFacts
 from .estimate import Estimate, Interval
 
 MISSING = "\N{EN DASH}"
@@ -80,23 +79,6 @@ def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
         digits = _beside_zero(quantity.ci95, digits)
     text = number(quantity.value, digits) + unit
     return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
-
-
-def gait_frequency(gait: GaitFacts) -> str:
-    """Format the gait's frequency, or the frequency of each group of joints.
-
-    Returns:
-        For example ``0.97 Hz [0.969, 0.971]`` or ``1.432 Hz (8 joints) and 0.954 Hz (8 joints)``,
-        each with its interval.
-    """
-    if len(gait.groups) < 2:
-        return estimate(gait.frequency_hz, " Hz", most=4)
-    parts = [
-        f"{estimate(group.frequency_hz, ' Hz', most=4)} ({len(group.joints)} "
-        f"joint{'' if len(group.joints) == 1 else 's'})"
-        for group in gait.groups
-    ]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
 def _beside_zero(ci95: Interval, digits: int) -> int:

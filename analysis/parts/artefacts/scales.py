@@ -14,8 +14,8 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ..estimators.series import GAP_FACTOR, Series
-from ..results.answer import Span
+from ...estimators.series import GAP_FACTOR, Series
+from .result import Span
 
 DEGREE = float(np.degrees(1.0))
 UNIT_SLACK = 1.6

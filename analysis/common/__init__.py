@@ -1,0 +1,1 @@
+"""Values, remarks and formats that all of the analysis shares."""
