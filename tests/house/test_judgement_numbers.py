@@ -6,7 +6,7 @@ import pytest
 
 from support.paths import ROOT
 
-ROOMS = ("capture/judgement", "analysis/segments")
+ROOMS = ("capture/judgement", "analysis/parts/comparison", "analysis/parts/judgement")
 MOST = 40
 PLAIN = {-1, 0, 1, 2}
 UNITS = {100, 1000}  # percent, and thousandths
@@ -31,6 +31,7 @@ def test_the_judgement_has_few_numbers():
         for path in SOURCES
         for node in numbers_of(ast.parse(path.read_text()))
     }
+    assert {path.parent for path in SOURCES} == {ROOT / room for room in ROOMS}
     assert 0 < len(numbers) <= MOST, numbers
 
 
