@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from undulog.capture import Session
-from undulog.capture.exchange.bag_import import import_bag
+from undulog.capture.exchange.formats.rosbag.importing import import_bag
 
 BAR = 1.3
 STATE = "sensor_msgs/msg/JointState"

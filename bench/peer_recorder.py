@@ -21,7 +21,7 @@ from pathlib import Path
 import can
 from mcap_ros2.writer import Writer
 
-from undulog.capture.exchange.frame_formats import SCHEMA, TYPE_NAME
+from undulog.capture.exchange.formats.can_msgs import SCHEMA, TYPE_NAME
 
 
 class Ros2Listener(can.Listener):

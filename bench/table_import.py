@@ -24,8 +24,9 @@ from measuring import Took, arguments, in_turn, took
 from pyarrow import parquet as arrow_parquet
 from records import compared, versions
 
-from undulog.capture.exchange.lerobot_import import import_lerobot
-from undulog.capture.exchange.table_import import import_tables, open_tables
+from undulog.capture.exchange.formats.lerobot.importing import import_lerobot
+from undulog.capture.exchange.registry.registry import open_table
+from undulog.capture.exchange.table_import import import_tables, of_files, prepared
 
 arrow: Any = pa  # its types are incomplete
 parquet: Any = arrow_parquet
@@ -80,7 +81,7 @@ def main() -> int:
             (
                 f"import CSV, {options.rows} rows, {JOINTS} joints",
                 f"{versions('pandas')} read_csv",
-                lambda: import_tables(open_tables(log), out),
+                lambda: import_tables(prepared(of_files(open_table(log))), out),
                 lambda: pd.read_csv(log),
             ),
             (

@@ -27,7 +27,7 @@ def is_data_set(path: Path) -> bool:
     """Return whether a path is the folder of a LeRobot data set."""
     if not path.is_dir():
         return False
-    from undulog.capture.exchange.lerobot_import import is_lerobot
+    from undulog.capture.exchange.formats.lerobot.format import is_lerobot
 
     return is_lerobot(path)
 
@@ -39,8 +39,8 @@ def analyse_data_set(folder: Path) -> EpisodesResult:
         ImportFormatError: If it is damaged.
         MissingExtraError: If pyarrow is not installed.
     """
-    from undulog.capture.exchange.lerobot_frames import read_frames
-    from undulog.capture.exchange.lerobot_import import open_lerobot
+    from undulog.capture.exchange.formats.lerobot.frames import read_frames
+    from undulog.capture.exchange.formats.lerobot.importing import open_lerobot
 
     from ..parts.episodes.measure import measure_episodes
     from ..parts.episodes.record import Record

@@ -9,24 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from ..common.console import echo, emit
-from ..common.errors import ImportFormatError, UsageError
-from ..common.files import check_output, is_file, why_no_file
+from ..common.errors import UsageError
+from ..common.files import check_output
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
-    from ..exchange.can_import import ImportReport
-    from ..exchange.column_map import ColumnMap
-    from ..robot.model import Robot
-
-_LEROBOT, _BAG = "is a LeRobot dataset, which names its columns itself", "is a bag of ROS"
-_TABLE, _FRAMES = "holds no CAN frames", "holds CAN frames"
-_OPTIONS = {
-    _LEROBOT: ("--unit", "--episode"),
-    _BAG: ("--command-topic", "--response-topic"),
-    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map", "--fps"),
-    _FRAMES: ("--bus",),
-}
-"""Kind of a log to the options that are for it alone."""
+    from ..exchange.formats.format import Reader
+    from ..exchange.reports import ImportReport
 
 
 def import_log(
@@ -89,58 +78,30 @@ def import_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
+    from ..common.process import interruptible
+    from ..exchange.import_options import ImportOptions
+    from ..exchange.registry.registry import format_of, open_table
+
     if map_ and log.is_dir():
         raise UsageError(f"{log} is a folder; --map is for one table")
-    from ..common.process import interruptible
-    from ..exchange.bag_import import import_bag, is_recording
-    from ..exchange.can_import import import_can
-    from ..exchange.lerobot_import import import_lerobot, is_lerobot
-    from ..exchange.table_guess import parse_units
-    from ..exchange.table_import import import_tables, open_mapped, open_tables
-    from ..robot.description import load_robot
-
-    if not log.is_dir() and not is_file(log):
-        raise ImportFormatError(log, why_no_file(log))
-    dataset = log.is_dir() and is_lerobot(log)
-    if not dataset or output.suffix:
+    _, reader = format_of(log)
+    if output.suffix or not reader.several:
         why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
         check_output(output, (".mcap",), why, force=force)
-    bag = not dataset and is_recording(log)
-    table = not bag and _is_table(log)
     given = {"--commands": commands, "--columns": columns, "--map": map_, "--unit": unit}
     given |= {"--write-map": write_map, "--fps": fps, "--episode": episode, "--bus": bus}
     if topics != CONTRACT:
         given |= {"--command-topic": topics.command_topic, "--response-topic": topics}
-    kind = _LEROBOT if dataset else _BAG if bag else _TABLE if table else _FRAMES
-    _check_options(log, kind, [name for name, value in given.items() if value not in (None, ())])
-    described = None if bag or robot is None else load_robot(robot)
-    units = parse_units(unit)
-    column_map = _column_map(described, columns, map_)
+    _check_options(log, reader, [name for name, value in given.items() if value not in (None, ())])
     with interruptible() as stop:
-        if dataset:
-            reports = import_lerobot(
-                log, output, episode=episode, robot=described, units=units, force=force, stop=stop
-            )
-        elif bag:
-            names = topics.names
-            reports = [import_bag(log, output, robot=robot, topics=names, force=force, stop=stop)]
-        elif not table:
-            if described is None:
-                raise UsageError(f"{log} holds CAN frames: --robot says what they mean")
-            reports = [import_can(log, output, described, bus=bus, force=force, stop=stop)]
-        else:
-            by_map = described and column_map if commands is fps is None else None
-            if by_map and log.suffix.lower() == ".csv":
-                tables = open_mapped(log, by_map)
-            else:
-                tables = open_tables(log, commands, fps)
-            report = import_tables(
-                tables, output, robot=described, column_map=column_map, units=units,
-                write_map=write_map, force=force, stop=stop,
-            )  # fmt: skip
-            reports = [report]
+        options = ImportOptions(
+            robot=robot, commands=None if commands is None else open_table(commands),
+            columns=columns, map=map_, units=unit, write_map=write_map, fps=fps, episode=episode,
+            bus=bus, topics=topics.names, force=force, stop=stop,
+        )  # fmt: skip
+        reports = reader.into_session(log, output, options)
     code = _report_imports(reports, json=json)
-    if dataset and len(reports) > 1 and not json:
+    if len(reports) > 1 and not json:
         echo(f"what is wrong with which episode: undulog analyse {log}")
     return code
 
@@ -152,30 +113,9 @@ def _report_imports(reports: Sequence[ImportReport], *, json: bool) -> int:
     return 0 if all(report.complete for report in reports) else 1
 
 
-def _check_options(log: Path, kind: str, given: Sequence[str]) -> None:
-    if wrong := [name for name in given if name not in _OPTIONS[kind]]:
-        raise UsageError(f"{log} {kind}; {', '.join(wrong)}: for logs of another kind")
-
-
-def _is_table(log: Path) -> bool:
-    """Return whether a log is a table, or a folder of tables, and no log of CAN frames."""
-    from ..exchange.can_logs import is_frame_csv
-    from ..exchange.tables import TABLE_SUFFIXES
-
-    return log.is_dir() or (log.suffix.lower() in TABLE_SUFFIXES and not is_frame_csv(log))
-
-
-def _column_map(
-    robot: Robot | None, columns: Path | None, options: tuple[str, ...]
-) -> ColumnMap | None:
-    """Return the column map that was given; None if it is to be guessed."""
-    from ..exchange.column_map import column_map_from_options, read_column_map
-
-    if columns is not None and options:
-        raise UsageError("--columns MAP.toml or --map options, not both")
-    if columns is not None:
-        return read_column_map(columns, robot)
-    return column_map_from_options(options, robot) if options else None
+def _check_options(log: Path, reader: Reader, given: Sequence[str]) -> None:
+    if wrong := [name for name in given if name not in reader.options]:
+        raise UsageError(f"{log} {reader.holds}; {', '.join(wrong)}: for logs of another kind")
 
 
 def _import_lines(report: ImportReport) -> Iterator[str]:

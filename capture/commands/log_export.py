@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from ..common.console import emit
 from ..common.errors import UsageError
 from .sessions import sessions_of
-
-if TYPE_CHECKING:
-    from ..exchange.export import ExportReport
 
 Target = Literal["wide", "lerobot", "rosbag2", "tum", "foxglove-layout", "plotjuggler-layout"]
 
@@ -81,18 +75,22 @@ def log_export(
         json: Report as one JSON object.
     """
     from ..common.process import interruptible
+    from ..exchange.registry.registry import format_for
 
     if not sessions:
         raise UsageError("log export needs a session, e.g. undulog log export run.mcap -o run.csv")
     options = {"bus": bus, "topics": topics, "fps": fps, "task": task, "frame": frame}
     given = {key: value for key, value in options.items() if value not in (None, ())}
-    name, target = _target(to, output)
-    target.check(name, sessions, given)
-    read: Any = tuple(sessions_of(sessions)) if target.several else sessions[0]
-    export = getattr(import_module(f"undulog.capture.exchange.{target.module}"), target.function)
+    name, writer = format_for(output, to)
+    for option in given:
+        if option not in writer.options:
+            raise UsageError(f"--{option} is for {_FOR[option]}; {name} {writer.holds}")
+    if len(sessions) > 1 and not writer.several:
+        raise UsageError(f"{name} takes one session, not {len(sessions)}")
+    read = sessions_of(sessions) if writer.several else list(sessions)
     with interruptible() as stop:
-        written: ExportReport = export(read, output, **given, force=force, stop=stop)
-    source: Any = [str(path) for path in read] if target.several else str(read)
+        written = writer.out_of_session(read, output, **given, force=force, stop=stop)
+    source = [str(path) for path in read] if writer.several else str(read[0])
     facts = {"source": source, "output": str(output), **written.facts}
     facts["warnings"] = written.warnings
     lines = [
@@ -100,71 +98,3 @@ def log_export(
         *(f"  warning: {warning}" for warning in written.warnings),
     ]
     emit(facts, lines, as_json=json)
-
-
-@dataclass(frozen=True)
-class _Target:
-    """A kind of output.
-
-    Attributes:
-        module: That of the exchange that writes it.
-        function: Its function that does, which has the options as arguments.
-        holds: What it has, for the refusal of options of other kinds.
-        takes: The options that it has.
-        several: Whether it takes several sessions.
-    """
-
-    module: str
-    function: str
-    holds: str
-    takes: tuple[str, ...] = ()
-    several: bool = False
-
-    def check(self, name: str, sessions: tuple[Path, ...], given: Mapping[str, object]) -> None:
-        """Refuse options and sessions that it doesn't take.
-
-        Raises:
-            UsageError: If there are some.
-        """
-        for option in given:
-            if option not in self.takes:
-                raise UsageError(f"--{option} is for {_FOR[option]}; {name} {self.holds}")
-        if len(sessions) > 1 and not self.several:
-            raise UsageError(f"{name} takes one session, not {len(sessions)}")
-        if "fps" in self.takes and "fps" not in given:
-            raise UsageError(f"{name} needs --fps, the frames a second of the dataset")
-
-
-def _target(to: str | None, output: Path) -> tuple[str, _Target]:
-    """Return the kind of output and its name in messages."""
-    from ..exchange.export import TABLE_FORMATS
-    from ..exchange.frame_formats import FRAME_FORMATS
-
-    if to is not None:
-        return f"--to {to}", _TARGETS[to]
-    suffix = output.suffix.lower()
-    if suffix in FRAME_FORMATS:
-        return f"a {suffix} file", _FRAMES
-    if suffix in TABLE_FORMATS:
-        return f"a {suffix} file", _TABLE
-    valid = ", ".join([*FRAME_FORMATS, *TABLE_FORMATS])
-    raise UsageError(
-        f"{output}: no format has the suffix {suffix!r}; valid: {valid}, or --to "
-        f"{', '.join(_TARGETS)}"
-    )
-
-
-_FRAMES = _Target("export", "export_log", "has CAN frames", ("bus",))
-_TABLE = _Target("export", "export_columns", "has joint columns", ("topics",))
-_TARGETS = {
-    "wide": _Target("wide_table", "export_wide", "has joint columns", ("topics",)),
-    "lerobot": _Target(
-        "lerobot_export", "export_lerobot", "has episodes", ("fps", "task"), several=True
-    ),
-    "rosbag2": _Target("rosbag2_export", "export_rosbag2", "has all messages"),
-    "tum": _Target("tum", "export_tum", "has poses", ("frame",)),
-    **{
-        f"{name}-layout": _Target("plot_layouts", f"export_{name}_layout", "has plots", ("topics",))
-        for name in ("foxglove", "plotjuggler")
-    },
-}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
@@ -15,6 +16,12 @@ from ..common.errors import ImportFormatError, MissingExtraError
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
+
+WriteCells: TypeAlias = Callable[[Sequence[NDArray[Any]]], None]
+"""Writes rows: an array a column, all of one length. A masked number has no value, NaN is one."""
+
+OpenTable: TypeAlias = Callable[[Path, Mapping[str, str]], AbstractContextManager[WriteCells]]
+"""Creates a file with columns of some names and kinds: ``int64``, ``float64`` or ``text``."""
 
 WIDEST = 4096
 """Most columns of a table."""
@@ -55,6 +62,11 @@ def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
         )
     single = all(column.dtype == np.float32 for column in columns)
     return np.stack(columns, axis=1, dtype=np.float32 if single else np.float64)
+
+
+def with_gaps(values: NDArray[Any], missing: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers of which some are masked: there is no value, not even NaN."""
+    return np.ma.array(values, mask=missing)  # pyright: ignore[reportUnknownMemberType]
 
 
 def _address(array: NDArray[Any]) -> int:

@@ -205,6 +205,20 @@ def is_remote(frames: FrameArray) -> BoolArray:
     return ((frames["id_flags"] & wire.REMOTE_FLAG) != 0) & ~is_error(frames)
 
 
+def possible(block: LogBlock) -> FrameArray:
+    """Copy frames, remote ones without data, CAN FD ones with 64 bytes and never remote."""
+    frames, is_fd = block.frames.copy(), block.is_fd
+    frames["id_flags"][is_fd] &= ~np.uint32(wire.REMOTE_FLAG)
+    frames["len"][is_fd] = np.minimum(frames["len"][is_fd], 64)
+    frames["data"][is_remote(frames)] = 0
+    return frames
+
+
+def shorten(frames: FrameArray, which: BoolArray) -> None:
+    """Limit the length code of some frames to 8, in place."""
+    frames["len"][which] = np.minimum(frames["len"][which], 8)
+
+
 @dataclass(frozen=True)
 class FrameFacts:
     """What is known of a session's frames before any is written.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..common.arrays import NS, FloatArray
 from ..common.errors import ImportFormatError, UsageError
 from .column_blocks import Block
-from .tables import TableFile, is_time, words
+from .table_file import TableFile, is_time, words
 
 LEAST_LIKELY = 0.6
 """DeepLabCut's own default."""

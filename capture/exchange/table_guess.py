@@ -26,7 +26,7 @@ from .column_blocks import WIDEST, Block
 from .column_map import COMMANDS, STATES, ColumnMap, MappedColumn
 from .frame_log import LATEST_NS
 from .marker_tracks import is_frame_number
-from .tables import TableFile, is_time, words
+from .table_file import TableFile, is_time, words
 
 _COMMAND = {
     "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets",

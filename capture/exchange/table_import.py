@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import heapq
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,26 +17,33 @@ from numpy.typing import NDArray
 from ..common.arrays import NS, FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
-from ..common.files import check_regular, write_text
+from ..common.files import write_text
 from ..common.process import StopRequest
 from ..log.mcap.writer import Compression
 from ..log.read.facts import TIMES_FROM_FPS
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
-from .can_import import LEVEL, ImportReport, digest_of, imported_session
-from .column_blocks import Block, joined
-from .column_map import COMMANDS, STATES, ColumnMap, JointTopic, MappedColumn, topics_of
+from .column_blocks import Block, joined, refuse
+from .column_map import (
+    COMMANDS,
+    STATES,
+    ColumnMap,
+    JointTopic,
+    MappedColumn,
+    column_map_from_options,
+    read_column_map,
+    topics_of,
+)
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
+from .import_options import ImportOptions
 from .marker_tracks import as_joints, with_fps
-from .table_guess import guess_map
-from .tables import TABLE_SUFFIXES, TableFile, is_time, open_csv, open_table, words
+from .reports import ImportReport
+from .session_import import LEVEL, digest_of, imported_session
+from .table_file import TableFile, as_wide, is_time, words
+from .table_guess import guess_map, parse_units
 
-_COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", "target", "targets"}
-_STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
-_EVENT_FILES = {"event", "events"}
 _MOST = 1e200
-_MOST_NAMES = 1 << 16  # bytes of a list of joints
 
 
 @dataclass(frozen=True)
@@ -72,104 +78,75 @@ class TableSet:
     tables: dict[str, TableFile]
     digest: Callable[[], str]
     joints: tuple[str, ...] = ()
-    events: Path | None = None
+    events: TableFile | None = None
     left_out: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     compression: Compression = LEVEL
 
 
-def open_tables(source: Path, commands: Path | None = None, fps: float | None = None) -> TableSet:
-    """Find the tables of a recording.
+def of_files(table: TableFile, commands: TableFile | None = None) -> TableSet:
+    """Return a recording of one table, or of states and commands in two."""
+    tables = {STATES: table} | ({COMMANDS: commands} if commands is not None else {})
+    return TableSet(table.path, tables, partial(digest_of, [t.path for t in tables.values()]))
 
-    Args:
-        source: A table of states, or a folder with tables of states and commands, their names as
-            ``control.csv`` and ``state_motor.csv``, with ``joint_list.txt`` and ``event.csv``.
-        commands: A table of commands.
-        fps: Rows a second of tables without times.
+
+def with_options(table_set: TableSet, output: Path, options: ImportOptions) -> ImportReport:
+    """Turn tables into a session, by the options of the command; see :func:`import_tables`.
 
     Raises:
         UsageError: If ``fps`` is given for a table that has times.
-        ImportFormatError: If a file is no table, or the folder has none, or too many.
     """
-    if source.is_dir():
-        if commands is not None:
-            raise UsageError(f"{source} is a folder; --commands goes with a table of states")
-        folder = _open_folder(source)
-    else:
-        tables = {STATES: open_table(source)}
-        if commands is not None:
-            tables[COMMANDS] = open_table(commands)
-        files = [source, *([commands] if commands is not None else [])]
-        folder = TableSet(source, tables, partial(digest_of, files))
-    joints = {role: as_joints(table) or table for role, table in folder.tables.items()}
+    robot = options.described()
+    column_map = _column_map(robot, options)
+    needed = () if column_map is None else [column.column for column in column_map.columns]
+    return import_tables(
+        prepared(table_set, options.fps, needed),
+        output,
+        robot=robot,
+        column_map=column_map,
+        units=parse_units(options.units),
+        write_map=options.write_map,
+        force=options.force,
+        stop=options.stop,
+    )
+
+
+def _column_map(robot: Robot | None, options: ImportOptions) -> ColumnMap | None:
+    """Return the column map that was given; None if it is to be guessed."""
+    if options.columns is not None and options.map:
+        raise UsageError("--columns MAP.toml or --map options, not both")
+    if options.columns is not None:
+        return read_column_map(options.columns, robot)
+    return column_map_from_options(options.map, robot) if options.map else None
+
+
+def prepared(
+    table_set: TableSet, fps: float | None = None, needed: Collection[str] = ()
+) -> TableSet:
+    """Return tables of times and joints: long ones made wide, tracks turned into angles.
+
+    Args:
+        fps: Rows a second of tables without times.
+        needed: Columns that a map names; a table that has all of them stays as it is.
+
+    Raises:
+        UsageError: If ``fps`` is given for a table that has times.
+    """
+    tables = dict(table_set.tables)
+    for role, table in tables.items():
+        if not needed or not {*table.columns}.issuperset(needed):
+            wide = as_wide(table) or table
+            tables[role] = as_joints(wide) or wide
     if fps is None:
-        return replace(folder, tables=joints)
+        return replace(table_set, tables=tables)
     if not 0 < fps < NS:
         raise UsageError(f"--fps {fps:g}: more than 0 and less than 1e9 frames a second")
     made = {
         "import.time": f"made from the number of the frame and fps = {fps:g}",
         TIMES_FROM_FPS: f"{fps:g}",
     }
-    tables = {role: with_fps(table, fps) for role, table in joints.items()}
-    return replace(folder, tables=tables, facts={**folder.facts, **made})
-
-
-def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
-    """Take a CSV file with a header by its column map: a fault names row and column.
-
-    Raises:
-        ImportFormatError: If it can't be read, or a column is not there once.
-    """
-    columns = [column.column for column in column_map.columns]
-    table = open_csv(source, column_map.time_column, columns, column_map.delimiter)
-    return TableSet(source, {STATES: table}, partial(digest_of, [source]))
-
-
-def _open_folder(folder: Path) -> TableSet:
-    by_role: dict[str, list[Path]] = {STATES: [], COMMANDS: [], "events": [], "names": []}
-    others: list[str] = []
-    for path in sorted(folder.iterdir()):
-        labels = set(words(path.stem))
-        if path.suffix.lower() == ".txt" and {"list", "names"} & labels:
-            by_role["names"].append(path)
-        elif path.suffix.lower() not in TABLE_SUFFIXES:
-            others.append(path.name)
-        elif labels & _EVENT_FILES:
-            by_role["events"].append(path)
-        elif labels & _COMMAND_FILES:
-            by_role[COMMANDS].append(path)
-        elif labels & _STATE_FILES:
-            by_role[STATES].append(path)
-        else:
-            others.append(path.name)
-    for role in (STATES, COMMANDS):
-        if len(by_role[role]) > 1:
-            names = ", ".join(path.name for path in by_role[role])
-            raise ImportFormatError(
-                folder, f"has several tables of {role}: {names}; give one, and --commands"
-            )
-    tables = {role: open_table(by_role[role][0]) for role in (STATES, COMMANDS) if by_role[role]}
-    if not tables:
-        raise ImportFormatError(
-            folder,
-            "has no table named as states or commands (state*.csv, control.csv); it has "
-            f"{some_names(others, 10) or 'nothing'}",
-        )
-    events = by_role["events"][0] if by_role["events"] else None
-    files = [path for paths in by_role.values() for path in paths]
-    joints = _names(by_role["names"][0]) if by_role["names"] else ()
-    return TableSet(folder, tables, partial(digest_of, files), joints, events, tuple(others))
-
-
-def _names(path: Path) -> tuple[str, ...]:
-    try:
-        check_regular(path)
-        if path.stat().st_size > _MOST_NAMES:
-            raise ImportFormatError(path, "is no list of joints: too long")
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
-    return tuple(word for word in text.replace(",", "\n").split() if word)
+    tables = {role: with_fps(table, fps) for role, table in tables.items()}
+    return replace(table_set, tables=tables, facts={**table_set.facts, **made})
 
 
 def import_tables(
@@ -298,13 +275,16 @@ class _Source:
         self._unit_ns = TIME_UNITS[unit]
         names = [self._time, *(column.column for column in self.columns)]
         for name in names if self.columns else ():
-            if name not in table.columns:
-                raise ImportFormatError(
-                    table.path, f"has no column {name!r}; it has {some_names(table.columns, 20)}"
+            if (count := table.columns.count(name)) != 1:
+                refuse(
+                    table.path,
+                    f"has {count or 'no'} column{'s' if count else ''} {name!r}; it has "
+                    f"{some_names(table.columns, 20)}",
                 )
         self._names = list(dict.fromkeys(names))
         self._order = 0 if role == COMMANDS else 1
         self._last_ns: int | None = None
+        self._rows = 0
         self._unwrapped: dict[str, tuple[float, float]] = {}
         self._missing: dict[str, int] = {}
         self._blocks = table.read(self._names, self._time) if self.columns else iter(())
@@ -313,7 +293,7 @@ class _Source:
         """Return the time of the first row [ns]."""
         block = next(self._blocks, None)
         if block is None or not len(block[self._time]):
-            raise ImportFormatError(self.table.path, "has no rows")
+            refuse(self.table.path, f"has no rows{' below its header' if self.table.row else ''}")
         self._blocks = chain([block], self._blocks)
         return int(self._times(block[self._time][:1])[0])
 
@@ -333,6 +313,7 @@ class _Source:
                 continue
             t_ns = self._checked(self._times(block[self._time]), offset)
             values = {key: self._converted(group, block) for key, group in columns.items()}
+            self._rows += len(t_ns)
             yield _Messages(
                 (int(t_ns[0]), self._order),
                 int(t_ns[-1]),
@@ -344,41 +325,44 @@ class _Source:
         names = [column.column for column in self.columns if self._missing.get(column.column)]
         return [f"column {name!r}: {self._missing[name]} cells without a value" for name in names]
 
+    def _fault(self, column: str, at: int, why: str) -> NoReturn:
+        """Refuse a cell of the block at hand; its row is named where the file has such rows."""
+        row = f"row {self.table.row(self._rows + at)}, " if self.table.row else ""
+        refuse(self.table.path, f"{row}column {column!r}: {why}")
+
     def _times(self, cells: NDArray[Any]) -> IntArray:
-        unit, path = self._unit_ns, self.table.path
-        try:
-            if cells.dtype.kind in "iu":
-                if np.abs(cells.astype(float)).max(initial=0) * unit >= LATEST_NS:
-                    raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
-                t_ns = cells.astype(np.int64) * unit
-            elif cells.dtype.kind == "f":
-                with np.errstate(over="ignore"):
-                    t_ns = np.rint(cells.astype(float) * unit)
-            else:
-                t_ns = np.array([_exact_ns(str(cell).replace(",", "."), unit) for cell in cells])
-            if len(t_ns) and not np.all(np.abs(t_ns.astype(float)) < LATEST_NS):
-                raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
-            return t_ns.astype(np.int64)
-        except (ArithmeticError, ValueError, TypeError) as error:
-            if isinstance(error, ImportFormatError):
-                raise
-            raise ImportFormatError(path, f"column {self._time!r} holds no times") from error
+        unit, name = self._unit_ns, self._time
+        if cells.dtype.kind in "iuf":
+            with np.errstate(over="ignore"):
+                t_ns = cells.astype(float) * unit
+            if not np.all(np.abs(t_ns) < LATEST_NS):
+                refuse(self.table.path, f"column {name!r}: no time before 2038")
+            return cells.astype(np.int64) * unit if cells.dtype.kind != "f" else _rounded(t_ns)
+        exact = np.empty(len(cells), dtype=np.int64)
+        for at, cell in enumerate(cells):
+            text = str(cell)
+            try:
+                exact[at] = _exact_ns(text.replace(",", "."), unit)
+            except OverflowError:
+                self._fault(name, at, f"{text[:40]!r} is no time before 2038")
+            except (ArithmeticError, ValueError):
+                self._fault(name, at, f"{text[:40]!r} is not a time")
+        return exact
 
     def _checked(self, t_ns: IntArray, offset: int) -> IntArray:
         """Return the times of a session, which don't go back."""
         before = self._last_ns if self._last_ns is not None else int(t_ns[0])
-        back = np.flatnonzero(np.diff(t_ns, prepend=before) < 0)
+        steps = np.diff(t_ns, prepend=before)
+        back = np.flatnonzero(steps < 0)
         if len(back):
-            raise ImportFormatError(
-                self.table.path,
-                f"column {self._time!r}: time goes back, to {int(t_ns[back[0]]) / 1e9:g} s",
-            )
+            at = int(back[0])
+            now = int(t_ns[at])
+            ago = now - int(steps[at])
+            self._fault(self._time, at, f"time goes back, from {ago / NS:g} to {now / NS:g} s")
         self._last_ns = int(t_ns[-1])
         stamps = t_ns + offset
         if not 0 <= int(stamps[0]) <= int(stamps[-1]) < LATEST_NS:
-            raise ImportFormatError(
-                self.table.path, f"column {self._time!r}: not all times are from 1970 to 2038"
-            )
+            refuse(self.table.path, f"column {self._time!r}: not all times are from 1970 to 2038")
         return stamps
 
     def _converted(self, columns: Sequence[MappedColumn], block: Block) -> FloatArray:
@@ -392,12 +376,10 @@ class _Source:
         if not -_MOST < float(values.min()) <= float(values.max()) < _MOST:
             present = ~np.isnan(values)
             for column, numbers, there in zip(columns, values.T, present.T, strict=True):
-                if not np.all(np.abs(numbers[there]) < _MOST):
-                    raise ImportFormatError(
-                        self.table.path,
-                        f"column {column.column!r} has a number that is not finite or beyond "
-                        f"{_MOST:g}",
-                    )
+                if len(bad := np.flatnonzero(there & ~(np.abs(numbers) < _MOST))):
+                    text = str(numbers[bad[0]])
+                    why = f"{text!r} is not a finite number, or beyond {_MOST:g}"
+                    self._fault(column.column, int(bad[0]), why)
                 missing = self._missing.get(column.column, 0) + int(len(numbers) - there.sum())
                 self._missing[column.column] = missing
         if changed:
@@ -411,11 +393,9 @@ class _Source:
             return cells
         try:
             return cells.astype(np.float64)
-        except (ValueError, TypeError) as error:
-            bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
-            raise ImportFormatError(
-                self.table.path, f"column {column.column!r}: {bad!r} is not a number"
-            ) from error
+        except (ValueError, TypeError):
+            bad = next((at for at, cell in enumerate(cells) if not _is_number(cell)), 0)
+            self._fault(column.column, bad, f"{str(cells[bad])[:40]!r} is not a number")
 
     def _in_unit(self, column: MappedColumn, values: FloatArray) -> FloatArray:
         """Convert numbers to the session's unit: unwrapped over blocks, scaled and offset."""
@@ -429,6 +409,10 @@ class _Source:
         scaled = values if column.scale == 1.0 else column.scale * values
         unit = unit_for(column.unit, column.quantity)
         return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
+
+
+def _rounded(t_ns: FloatArray) -> IntArray:
+    return np.rint(t_ns).astype(np.int64)
 
 
 def _exact_ns(text: str, unit_ns: int) -> int:
@@ -463,34 +447,30 @@ def _write_block(
 
 
 def _events(
-    path: Path, unit: str, offset: int, writer: SessionWriter, report: ImportReport
+    table: TableFile, unit: str, offset: int, writer: SessionWriter, report: ImportReport
 ) -> Iterator[_Messages]:
     """Yield the events of a table, a time and a text a row, in order of time."""
-    try:
-        check_regular(path)
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ImportFormatError(path, f"can't be read: {error}") from error
-    head = rows[0] if rows else []
-    time = next((i for i, name in enumerate(head) if is_time(name)), None)
+    path = table.path
+    time = next((name for name in table.columns if is_time(name)), None)
     if time is None:
-        raise ImportFormatError(path, "has no column of times")
-    text = next((i for i, name in enumerate(head) if "event" in words(name)), len(head) - 1)
+        refuse(path, "has no column of times")
+    text = next((name for name in table.columns if "event" in words(name)), table.columns[-1])
     log = writer.log()
     events: list[tuple[int, str]] = []
-    for row in rows[1:]:
-        try:
-            t_ns = _exact_ns(row[time], TIME_UNITS[unit]) + offset
+    for block in table.read([time, text], time):
+        for stamp, event in zip(block[time].tolist(), block[text].tolist(), strict=True):
+            try:
+                t_ns = _exact_ns(str(stamp), TIME_UNITS[unit]) + offset
+            except ArithmeticError as error:
+                why = f"{stamp!r} is no time before 2038"
+                raise ImportFormatError(path, why) from error
             if not 0 <= t_ns < LATEST_NS:
-                raise ImportFormatError(path, f"{row[time]!r} is no time before 2038")
-            events.append((t_ns, row[text]))
-        except (ArithmeticError, LookupError) as error:
-            raise ImportFormatError(path, f"row {row!r} has no time and event") from error
+                refuse(path, f"{stamp!r} is no time before 2038")
+            events.append((t_ns, str(event)))
 
-    def writing(t_ns: int, words_of: str) -> Callable[[], None]:
+    def writing(t_ns: int, event_text: str) -> Callable[[], None]:
         def write() -> None:
-            log.write(t_ns, "info", path.stem, words_of)
+            log.write(t_ns, "info", path.stem, event_text)
             report.samples["/rosout"] = report.samples.get("/rosout", 0) + 1
 
         return write

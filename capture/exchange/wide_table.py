@@ -12,25 +12,31 @@ one joint that repeat a time have as many rows of that time, in their order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import NS, FloatArray, IntArray
 from ..common.console import progress
 from ..common.errors import DataError, UsageError, some_names
-from ..common.files import as_text, check_stop, csv_writer, part_file
+from ..common.files import check_stop, part_file
 from ..common.process import StopRequest
 from ..common.strict_table import NAME_PATTERN
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import Quantity
-from .export import ExportReport, chosen_format, joint_fields, joint_topics, open_parquet
+from .column_blocks import OpenTable, with_gaps
+from .long_table import joint_fields, joint_topics
+from .reports import ExportReport
+from .session_export import refuse_session
+
+_HEAD = {"t_ns": "int64", "time [s]": "float64"}
+"""Columns before those of the joints."""
 
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block
@@ -147,6 +153,7 @@ def _rows(parts: Sequence[tuple[IntArray, slice]]) -> tuple[IntArray, list[IntAr
 
 
 def export_wide(
+    open_file: OpenTable,
     source: Path,
     output: Path,
     *,
@@ -159,13 +166,14 @@ def export_wide(
     The columns are held in files without names beside the output where they are large.
 
     Args:
-        output: The table to write; its suffix is one of :data:`WIDE_FORMATS`.
+        open_file: Creates the file.
+        output: The table to write.
         topics: JointState topics; if none, commands and all quantities that the joints measure.
         stop: Ends the export, with nothing left behind.
 
     Raises:
-        UsageError: If the suffix is no format that can be written, the output is the session, or
-            the table would be too wide, or large and nearly empty.
+        UsageError: If the output is the session, or the table would be too wide, or large and
+            nearly empty.
         OutputExistsError: If the output is there and ``force`` is not given.
         MissingChannelError: If the session has no such topic, or none of the default ones.
         DataError: If a topic is not of JointStates, or two columns would have one name.
@@ -173,7 +181,7 @@ def export_wide(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    open_table = chosen_format(WIDE_FORMATS, "wide table", source, output, force=force)
+    refuse_session(source, output, force=force)
     with Session.open(source, column_folder=output.parent) as session:
         columns, warnings = wide_columns(session, topics)
         names = [column.name for column in columns]
@@ -181,12 +189,12 @@ def export_wide(
         with (
             part_file(output) as part,
             progress(f"export {output.name}", 1.0) as bar,
-            open_table(part, names, start_ns) as write,
+            open_file(part, {**_HEAD, **dict.fromkeys(names, "float64")}) as write,
         ):
             for number, block in enumerate(wide_blocks(columns)):
                 if number % _FORGET_EVERY == 0:
                     session.forget()
-                write(block)
+                write(_cells(block, names, start_ns))
                 count += len(block.t_ns)
                 samples += sum(len(rows) for rows, _ in block.cells.values())
                 if count * len(names) > max(_MOST_SPARSE, _LEAST_FILLED * samples):
@@ -204,7 +212,7 @@ def export_wide(
                 "the long table (without --to wide) has no such cells"
             )
         warnings += session.warnings
-    names = ["t_ns", "time [s]", *names]
+    names = [*_HEAD, *names]
     what = f"{count} rows of {len(names)} columns"
     return ExportReport(what, {"rows": count, "columns": names}, warnings)
 
@@ -261,62 +269,17 @@ def wide_columns(
     return list(columns.values()), warnings
 
 
-WriteBlock = Callable[[WideBlock], None]
-
-
-@contextmanager
-def _open_csv(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
-    """Write CSV in UTF-8; floats with all digits that are needed."""
-    head = ["t_ns", "time [s]", *map(as_text, names)]
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv_writer(stream, head)
-        writer.writerow(head)
-        writer = csv_writer(stream, ())
-
-        def write(block: WideBlock) -> None:
-            empty = [""] * len(block.t_ns)
-            columns: list[Sequence[object]] = []
-            for name in names:
-                if name not in block.cells:
-                    columns.append(empty)
-                    continue
-                rows, values = block.cells[name]
-                cells: list[object] = list(empty)
-                for row, value in zip(rows.tolist(), values.tolist(), strict=True):
-                    cells[row] = value
-                columns.append(cells)
-            seconds = _seconds(block.t_ns, start_ns).tolist()
-            writer.writerows(zip(block.t_ns.tolist(), seconds, *columns, strict=True))
-
-        yield write
-
-
-@contextmanager
-def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
-    """Parquet: t_ns int64, the rest float64, null where a column has no sample."""
-    with open_parquet(path, {"t_ns": "int64"}, ["time [s]", *names]) as (module, write_arrays):
-
-        def write(block: WideBlock) -> None:
-            count = len(block.t_ns)
-            arrays: list[Any] = [module.array(block.t_ns)]
-            arrays.append(module.array(_seconds(block.t_ns, start_ns)))
-            for name in names:
-                if name not in block.cells:
-                    arrays.append(module.nulls(count, module.float64()))
-                    continue
-                rows, values = block.cells[name]
-                cells, missing = np.empty(count), np.ones(count, dtype=bool)
-                cells[rows], missing[rows] = values, False
-                cells[missing] = 0.0
-                arrays.append(module.array(cells, mask=missing, from_pandas=False))
-            write_arrays(arrays)
-
-        yield write
-
-
-def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
-    return (t_ns - start_ns) / NS
-
-
-WIDE_FORMATS: Mapping[str, Callable[..., Any]] = {".csv": _open_csv, ".parquet": _open_parquet}
-"""Suffix to the function that creates a table with columns of some names."""
+def _cells(block: WideBlock, names: Sequence[str], start_ns: int) -> list[NDArray[Any]]:
+    """Return an array for each column; a cell without a sample is masked, NaN is a sample."""
+    columns: list[NDArray[Any]] = [block.t_ns, (block.t_ns - start_ns) / NS]
+    count = len(block.t_ns)
+    none = with_gaps(np.zeros(count), np.ones(count, dtype=bool))
+    for name in names:
+        if name not in block.cells:
+            columns.append(none)
+            continue
+        rows, values = block.cells[name]
+        cells, missing = np.zeros(count), np.ones(count, dtype=bool)
+        cells[rows], missing[rows] = values, False
+        columns.append(with_gaps(cells, missing))
+    return columns

@@ -6,8 +6,8 @@ import can
 import numpy as np
 from can.util import CAN_FD_DLC
 
+from support.imported import import_can
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.exchange.can_import import import_can
 from undulog.capture.log.messages import frames as fr
 
 T0 = 1_700_000_003_250_000_000

@@ -23,8 +23,8 @@ from support.ros_bags import (
 )
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.exchange import bag_import
-from undulog.capture.exchange.bag_import import import_bag
+from undulog.capture.exchange.formats.rosbag import importing
+from undulog.capture.exchange.formats.rosbag.importing import import_bag
 
 pytestmark = pytest.mark.slow
 
@@ -181,7 +181,7 @@ def test_refusals_name_the_option(tmp_path, command, monkeypatch):
 def test_windows_do_not_show(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / "bag", fill_all)
     import_bag(bag, tmp_path / "x.mcap")
-    monkeypatch.setattr(bag_import, "_WINDOW_NS", 170_000_000)
+    monkeypatch.setattr(importing, "_WINDOW_NS", 170_000_000)
     import_bag(bag, tmp_path / "y.mcap")
     with Session.open(tmp_path / "x.mcap") as session, Session.open(tmp_path / "y.mcap") as other:
         for topic in ("/joint_states", "/joint_commands"):

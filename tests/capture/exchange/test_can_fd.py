@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.bus_robots import bus_robot
+from support.imported import export_file as export_log
+from support.imported import import_can
 from support.read_back import decoded_of
 from support.written_frames import T0, every_kind, frames_of, imported, log_messages, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages import frames as fr

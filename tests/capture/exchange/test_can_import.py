@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from support.imported import export_file as export_log
+from support.imported import import_can
 from support.paths import TRACE as RECORDING
 from support.written_frames import frames_of, log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError, OutputExistsError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages import frames as fr
@@ -141,7 +141,7 @@ def test_a_cut_blf_is_reported(tmp_path):
         ("x.asc", b"", "holds no CAN frames"),
         ("x.mf4", b"not a measurement" * 50, "can't be read: not an MF4 file"),
         ("x.log.gz", b"not gzip", "can't be read: Not a gzipped file"),
-        ("x.xyz", b"", "is no CAN log by its suffix; valid: .log, .asc, .blf, .trc, .csv"),
+        ("x.xyz", b"", "is of no format that can be imported: it is empty"),
     ],
 )
 def test_logs_that_are_none(name, data, message, tmp_path):

@@ -5,7 +5,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from undulog.capture.common.errors import ImportFormatError
-from undulog.capture.exchange.candump import candump_lines, read_candump
+from undulog.capture.exchange.formats.candump import candump_lines, read_candump
 from undulog.capture.exchange.frame_log import joined
 from undulog.capture.log.messages import frames as fr
 

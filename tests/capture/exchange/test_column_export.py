@@ -7,14 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from support.imported import TABLE_SUFFIXES, import_can, open_mapped
+from support.imported import export_file as export_columns
 from support.paths import TRACE as RECORDING
 from support.written_sessions import joint_state, write_foreign
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, MissingChannelError, MissingExtraError
-from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
-from undulog.capture.exchange.table_import import import_tables, open_mapped
+from undulog.capture.exchange.table_import import import_tables
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -59,11 +59,11 @@ def assert_same_samples(table, session, topic, field, column):
 
 
 @pytest.mark.parametrize("rows_per_block", [100_000, 10])
-@pytest.mark.parametrize("suffix", TABLE_FORMATS)
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
 def test_each_sample_has_a_row_at_its_own_time(
     suffix, rows_per_block, polled, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("undulog.capture.exchange.export._ROWS_PER_BLOCK", rows_per_block)
+    monkeypatch.setattr("undulog.capture.exchange.long_table._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
     report = export_columns(polled, output)
     assert report.facts["topics"] == {"/joint_states": 600, "/joint_current": 600}
@@ -97,7 +97,7 @@ def test_topics_can_be_chosen(polled, tmp_path):
     assert not (tmp_path / "y.csv").exists()
 
 
-@pytest.mark.parametrize("suffix", TABLE_FORMATS)
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
 def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path):
     # One message a servo, some without velocity: the fields don't share times.
     messages = []

@@ -6,14 +6,15 @@ import re
 import numpy as np
 import pytest
 
+from support.imported import open_mapped
 from support.paths import ARCSNAKE
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange import column_map
-from undulog.capture.exchange.can_logs import is_frame_csv
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.table_import import import_tables, open_mapped
+from undulog.capture.exchange.registry.registry import format_of
+from undulog.capture.exchange.table_import import import_tables
 
 GEAR = 22
 JOINT7 = f"""
@@ -146,7 +147,7 @@ def test_unwrapping_passes_over_gaps(tmp_path, opened):
         ("t,A1,b\n0,1,2\n", "log.csv: has no column 'a'; it has t, A1, b"),
         ("t,a,a\n0,1,2\n", "log.csv: has 2 columns 'a'; it has t, a, a"),
         ("t,a\n", "log.csv: has no rows below its header"),
-        ("", "log.csv: has no column 't'; it has none"),
+        ("", "log.csv: is no table: it is empty"),
     ],
 )
 def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path):
@@ -219,8 +220,8 @@ def test_options_and_file_say_the_same(tmp_path):
 
 def test_a_csv_of_can_frames_is_reported_from_others(tmp_path):
     header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
-    assert is_frame_csv(csv_file(tmp_path, header))
-    assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))
+    assert format_of(csv_file(tmp_path, header))[0].name == "can_csv"
+    assert format_of(csv_file(tmp_path, "time,a\n"))[0].name == "csv"
 
 
 def test_a_stopped_import_leaves_a_whole_file(tmp_path, opened):

@@ -5,27 +5,26 @@ import signal
 import numpy as np
 import pytest
 
+from support.imported import FRAME_SUFFIXES, TABLE_SUFFIXES, export_file, export_wide
 from support.written_frames import every_kind
 from support.written_topics import EPOCH_NS, write_topics
 from undulog.capture.common.errors import LogWriteError, UndulogError, UsageError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.exchange import export, lerobot_export, rosbag2_export, tum, wide_table
-from undulog.capture.exchange.export import TABLE_FORMATS, export_columns, export_log
-from undulog.capture.exchange.frame_formats import FRAME_FORMATS
-from undulog.capture.exchange.lerobot_export import export_lerobot
-from undulog.capture.exchange.rosbag2_export import export_rosbag2
-from undulog.capture.exchange.tum import export_tum
-from undulog.capture.exchange.wide_table import export_wide
+from undulog.capture.exchange import frame_export, long_table, wide_table
+from undulog.capture.exchange.formats import tum
+from undulog.capture.exchange.formats.lerobot import exporting as lerobot
+from undulog.capture.exchange.formats.rosbag import exporting as rosbag
+from undulog.capture.exchange.formats.tum import export_tum
 
 EXPORTS = {
-    "wide.csv": (export_wide, wide_table, "_seconds"),
-    "wide.parquet": (export_wide, wide_table, "_seconds"),
-    "dataset": (lambda path, *a, **o: export_lerobot([path], *a, fps=30, **o), lerobot_export,
+    "wide.csv": (export_wide, wide_table, "_cells"),
+    "wide.parquet": (export_wide, wide_table, "_cells"),
+    "dataset": (lambda path, *a, **o: lerobot.export_lerobot([path], *a, fps=30, **o), lerobot,
                 "aggregate_stats"),
-    "bag": (export_rosbag2, rosbag2_export, "_metadata"),
+    "bag": (rosbag.export_rosbag2, rosbag, "_metadata"),
     "x.tum": (export_tum, tum, "_lines"),
-    **{f"x{suffix}": (export_log, export.LossTally, "add") for suffix in FRAME_FORMATS},
-    **{f"x{suffix}": (export_columns, export, "_sorted_blocks") for suffix in TABLE_FORMATS},
+    **{f"x{suffix}": (export_file, frame_export.LossTally, "add") for suffix in FRAME_SUFFIXES},
+    **{f"x{suffix}": (export_file, long_table, "_sorted_blocks") for suffix in TABLE_SUFFIXES},
 }  # fmt: skip
 
 

@@ -13,13 +13,13 @@ from pyarrow import csv
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from support.imported import export_file as export_columns
+from support.imported import export_wide
 from support.read_back import decoded_of, messages_of
 from support.written_sessions import EPOCH_NS, NAMES, STEP_NS, write_session
-from undulog.capture.exchange.export import export_columns
-from undulog.capture.exchange.lerobot_export import export_lerobot
-from undulog.capture.exchange.lerobot_import import import_lerobot
-from undulog.capture.exchange.rosbag2_export import export_rosbag2
-from undulog.capture.exchange.wide_table import export_wide
+from undulog.capture.exchange.formats.lerobot.exporting import export_lerobot
+from undulog.capture.exchange.formats.lerobot.importing import import_lerobot
+from undulog.capture.exchange.formats.rosbag.exporting import export_rosbag2
 
 COUNT = 300
 T_NS = EPOCH_NS + STEP_NS * np.arange(COUNT)

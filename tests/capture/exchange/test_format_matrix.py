@@ -16,10 +16,10 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from support.imported import export_file as export_log
+from support.imported import import_can
 from support.written_frames import log_messages
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.messages import frames as fr
 

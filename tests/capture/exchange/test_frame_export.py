@@ -12,14 +12,14 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from support.imported import FRAME_SUFFIXES, import_can
+from support.imported import export_file as export_log
 from support.paths import TRACE as RECORDING
 from support.written_frames import T0, every_kind, frames_of, imported, write_frames
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UsageError
-from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import export_log
-from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.python_can import channel_numbers
 from undulog.capture.log.messages import frames as fr
 
 S = 1_000_000_000
@@ -202,7 +202,7 @@ def test_a_trace_without_a_date(tmp_path):
 # -- several buses, a stretch at a time ----------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", FRAME_FORMATS)
+@pytest.mark.parametrize("suffix", FRAME_SUFFIXES)
 def test_stretches_make_no_difference(suffix, tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     buses = {}

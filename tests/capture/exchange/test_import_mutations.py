@@ -6,12 +6,12 @@ import sqlite3
 import can
 import pytest
 
+from support.imported import import_can, open_mapped
 from support.written_frames import log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.table_import import import_tables, open_mapped
+from undulog.capture.exchange.table_import import import_tables
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
 LARGE = ("1e308", "-1e308", "1e19", "1e999999999", "9" * 400)

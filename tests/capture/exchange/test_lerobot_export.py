@@ -12,8 +12,8 @@ from support.written_sessions import write_commands
 from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, UsageError
-from undulog.capture.exchange.lerobot_export import export_lerobot
-from undulog.capture.exchange.lerobot_import import import_lerobot
+from undulog.capture.exchange.formats.lerobot.exporting import export_lerobot
+from undulog.capture.exchange.formats.lerobot.importing import import_lerobot
 
 G1 = SHARED / "g1_lerobot_v21"
 T0 = 1_700_000_000 * 10**9

@@ -10,8 +10,8 @@ import pytest
 from support.paths import SHARED
 from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
+from undulog.capture.exchange.formats.lerobot.importing import import_lerobot
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.lerobot_import import import_lerobot
 
 G1 = SHARED / "g1_lerobot_v21"
 JOINTS = ["shoulder_pan.pos", "elbow_flex.pos"]

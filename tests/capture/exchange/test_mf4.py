@@ -11,12 +11,12 @@ import can
 import numpy as np
 import pytest
 
+from support.imported import import_can
 from support.written_frames import log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
-from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.formats.mf4 import open_mf4
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
-from undulog.capture.exchange.mf4 import open_mf4
 from undulog.capture.log.messages.frames import ERROR_FLAG, REMOTE_FLAG
 
 asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")

@@ -15,11 +15,12 @@ from scipy.io import savemat
 
 from campaign.foreign import tensor
 from campaign.packed import MIB, constant_parquet, deflated_zeros, zip_of_stream
+from support.imported import open_tables
 from support.read_back import decoded_of
 from undulog.capture.common.errors import ImportFormatError
-from undulog.capture.exchange.lerobot_import import import_lerobot
-from undulog.capture.exchange.table_import import import_tables, open_tables
-from undulog.capture.exchange.tables import open_table
+from undulog.capture.exchange.formats.lerobot.importing import import_lerobot
+from undulog.capture.exchange.registry.registry import open_table
+from undulog.capture.exchange.table_import import import_tables
 
 T = np.arange(200) * 0.01
 

@@ -14,13 +14,9 @@ from mcap_ros2.decoder import DecoderFactory
 from support.written_sessions import joint_state, write_foreign
 from support.written_topics import write_topics
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.exchange.plot_layouts import (
-    JointPlot,
-    TopicCurve,
-    export_foxglove_layout,
-    export_plotjuggler_layout,
-    foxglove_layout,
-)
+from undulog.capture.exchange.formats.foxglove import export_foxglove_layout, foxglove_layout
+from undulog.capture.exchange.formats.plotjuggler import export_plotjuggler_layout
+from undulog.capture.exchange.joint_plots import JointPlot, TopicCurve
 
 T0 = 1_700_000_000 * 10**9
 NAMES = [f"j{k}" for k in range(8)]

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.written_sessions import EPOCH_NS, NAMES, samples, write_session
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
-from undulog.capture.exchange.rosbag2_export import export_rosbag2
+from undulog.capture.exchange.formats.rosbag.exporting import export_rosbag2
 from undulog.capture.log.edited_log import EDIT_RECORD, RawLog
 from undulog.capture.log.health.contract import check_contract
 

@@ -12,12 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
+from support.imported import open_tables
 from support.paths import ARCSNAKE, SHARED
 from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
-from undulog.capture.exchange.array_files import read_tensors
+from undulog.capture.exchange.formats.torch_tensors import read_tensors
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.table_import import import_tables, open_tables
+from undulog.capture.exchange.table_import import import_tables
 
 T = np.arange(300) * 0.01
 Q = np.stack([np.sin(3 * T + k) for k in range(3)], axis=1)
@@ -187,7 +188,7 @@ def test_a_huge_declared_shape_is_refused(tmp_path):
     ("text", "message"),
     [
         ("time,a_pos\n0,1\n1,x\n", "has the columns|no column|not a number|named as"),
-        ("time,a_pos\n0,1\n1,inf\n", "is not finite"),
+        ("time,a_pos\n0,1\n1,inf\n", "row 3, column 'a_pos': 'inf' is not a finite number"),
         ("time,a_pos\n1,1\n0.5,1\n", "time goes back"),
         ("time,b\n0,1\n1,2\n", "no column is named as a position"),
         ("x\n1\n", "is no table"),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.written_sessions import write_foreign, write_session
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
-from undulog.capture.exchange.tum import export_tum
+from undulog.capture.exchange.formats.tum import export_tum
 from undulog.capture.log.messages.definitions import schema_text
 
 T0 = 1_700_000_000 * 10**9

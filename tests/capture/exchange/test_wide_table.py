@@ -8,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from support.imported import TABLE_SUFFIXES, export_wide, open_tables
 from support.paths import SHARED
 from support.written_sessions import joint_state, write_foreign, write_session
 from support.written_topics import write_topics
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
-from undulog.capture.exchange.table_import import import_tables, open_tables
-from undulog.capture.exchange.wide_table import WIDE_FORMATS, WideColumn, export_wide, wide_blocks
+from undulog.capture.exchange.table_import import import_tables
+from undulog.capture.exchange.wide_table import WideColumn, wide_blocks
 
 T0 = 1_700_000_000 * 10**9
 NAMES = ("joint01", "leftKnee", "neck_pos-2")
@@ -68,7 +69,7 @@ def assert_same_samples(back, session):
     assert compared
 
 
-@pytest.mark.parametrize("suffix", WIDE_FORMATS)
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
 def test_an_import_of_the_table_gives_the_session(suffix, staggered, tmp_path, command, opened):
     table = tmp_path / f"run{suffix}"
     command("log", "export", staggered, "--to", "wide", "-o", table)
@@ -80,7 +81,7 @@ RECORDINGS = ("so101/multisine", "so101/coupled_joints", "go2/traj_0.pt")
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("suffix", WIDE_FORMATS)
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_real_recordings_come_back(name, suffix, tmp_path, opened):
     source, table = SHARED / name, tmp_path / f"x{suffix}"
@@ -92,7 +93,7 @@ def test_real_recordings_come_back(name, suffix, tmp_path, opened):
     assert_same_samples(opened(tmp_path / "back.mcap"), opened(tmp_path / "run.mcap"))
 
 
-@pytest.mark.parametrize("suffix", WIDE_FORMATS)
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
 def test_a_column_holds_the_samples_of_a_joint_at_their_times(suffix, staggered, tmp_path, opened):
     report = export_wide(staggered, tmp_path / f"x{suffix}")
     table = READ[suffix](tmp_path / f"x{suffix}")
@@ -116,7 +117,7 @@ def test_no_sample_and_a_sample_without_a_number_differ(tmp_path):
         states.write(T0, [np.nan])
         states.write(T0 + 1, [2.0])
         current.write(T0, [3.0])
-    for suffix in WIDE_FORMATS:
+    for suffix in TABLE_SUFFIXES:
         export_wide(tmp_path / "run.mcap", tmp_path / f"x{suffix}")
     text = (tmp_path / "x.csv").read_text().splitlines()
     assert text[1:] == [f"{T0},0.0,nan,3.0", f"{T0 + 1},1e-09,2.0,"]

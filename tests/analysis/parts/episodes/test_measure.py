@@ -196,8 +196,8 @@ def test_few_episodes_are_not_judged(arm):
 @pytest.mark.skipif(not G1.exists(), reason=f"the G1 data are not at {G1}")
 def test_pieces_of_a_real_humanoid():
     """Half-minutes of a person's work in 3 s pieces; frames and gains are taken from them."""
-    from undulog.capture.exchange.lerobot_frames import read_frames
-    from undulog.capture.exchange.lerobot_import import open_lerobot
+    from undulog.capture.exchange.formats.lerobot.frames import read_frames
+    from undulog.capture.exchange.formats.lerobot.importing import open_lerobot
 
     frames = read_frames(open_lerobot(G1))
     starts = [

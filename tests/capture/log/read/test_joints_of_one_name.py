@@ -7,7 +7,7 @@ from support.analysed import analysed
 from support.ros_bags import TRAJECTORY, filling, header, message, point, write_bag
 from support.written_sessions import EPOCH_NS, joint_state, write_foreign
 from undulog.capture import Session
-from undulog.capture.exchange.bag_import import import_bag
+from undulog.capture.exchange.formats.rosbag.importing import import_bag
 from undulog.capture.log.columns.names import (
     distinct_names,
     one_name_sentences,

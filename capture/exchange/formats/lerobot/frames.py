@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import FloatArray, IntArray
-from ..common.errors import ImportFormatError
-from .column_blocks import Block, refuse
-from .lerobot_import import FEATURES, LeRobotDataset, integers
-from .parquet_blocks import vectors_of
+from ....common.arrays import FloatArray, IntArray
+from ....common.errors import ImportFormatError
+from ...column_blocks import Block, refuse
+from ...parquet_blocks import vectors_of
+from .importing import FEATURES, LeRobotDataset, integers
 
 ROWS = 1 << 16
 """Rows that are read at once: with 29 joints 15 MB."""

@@ -12,19 +12,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..common.arrays import NS, FloatArray, IntArray
-from ..common.console import plain, progress
-from ..common.errors import DataError, MissingChannelError, some_names
-from ..common.files import check_output, check_stop, part_file
-from ..common.process import StopRequest
-from ..log.read.sample_times import clock_shift_ns
-from ..log.read.session import Session
-from .export import ExportReport
+from ...common.arrays import NS, FloatArray, IntArray
+from ...common.console import plain, progress
+from ...common.errors import DataError, MissingChannelError, some_names
+from ...common.files import check_output, check_stop, part_file
+from ...common.process import StopRequest
+from ..reports import ExportReport
+from .format import DirectWriter, Format, not_read
+
+if TYPE_CHECKING:
+    from ...log.read.session import Session
 
 SUFFIXES = (".tum", ".txt")
+"""Of a trajectory."""
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_FIELD = {
@@ -80,6 +84,8 @@ def export_tum(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
+    from ...log.read.session import Session
+
     why = f"end the name of a trajectory in {' or '.join(SUFFIXES)}"
     check_output(output, SUFFIXES, why, force=force)
     with Session.open(source) as session:
@@ -182,6 +188,8 @@ def _of_transforms(
     session: Session, topics: Sequence[str], frame: str | None
 ) -> tuple[PoseTrajectory | None, list[str]]:
     """Return the poses of a frame in its parent, by all topics; and the frames that there are."""
+    from ...log.read.sample_times import clock_shift_ns
+
     names: dict[str, None] = {}
     times: list[int] = []
     poses: list[list[float]] = []
@@ -206,3 +214,12 @@ def _of_transforms(
         return None, list(names)
     t_ns = np.array(times, dtype=np.int64)
     return PoseTrajectory(where, frame, tuple(parents), t_ns, np.array(poses)), list(names)
+
+
+FORMAT = Format(
+    "tum",
+    "TUM trajectory",
+    SUFFIXES,
+    not_read,
+    write=DirectWriter(export_tum, "has poses", ("frame",)),
+)

@@ -27,12 +27,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import NS, BoolArray, IntArray
-from ..common.errors import ImportFormatError
-from ..common.extras import undefer
-from ..log.messages import frames as wire
-from ..log.messages.frames import empty_fd_frames
-from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
+from ...common.arrays import NS, BoolArray, IntArray
+from ...common.errors import ImportFormatError, MissingExtraError
+from ...common.extras import is_installed, undefer
+from ...log.messages import frames as wire
+from ...log.messages.frames import empty_fd_frames
+from ..confined_log import confined
+from ..frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
+from ..frame_reader import FrameReader
+from ..packed import is_packed
+from .format import Format
 
 _KIND_FLAGS = {
     "CAN_DataFrame": 0,
@@ -139,7 +143,7 @@ def open_mf4(path: Path, scratch: Path) -> Generator[FrameLog]:
     # Its messages here are about decoding by databases inside the file, which is not needed.
     with _noted([]), _readable(path, "can't be read"):
         _check_head(path)
-        source = BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path
+        source = BytesIO(gzip.decompress(path.read_bytes())) if is_packed(path) else path
         mdf = MDF(source, temporary_folder=scratch)
     try:
         with _readable(path, "can't be read"):
@@ -151,7 +155,7 @@ def open_mf4(path: Path, scratch: Path) -> Generator[FrameLog]:
 
 def _check_head(path: Path) -> None:
     """Refuse what asammdf would take for something else, or leave open."""
-    opener = gzip.open if path.suffix == ".gz" else open
+    opener = gzip.open if is_packed(path) else open
     with opener(path, "rb") as stream:
         head = stream.read(64)
     if head[:8].strip() not in _VERSION_4:
@@ -353,3 +357,18 @@ def _merged(streams: list[Iterator[_Piece]]) -> Iterator[LogBlock]:
             rest = _Piece(head.order[cut:], head.block[cut:])
             heads[i] = rest if len(rest.order) else next(streams[i], None)
         yield joined(parts)[np.argsort(np.concatenate(orders), kind="stable")]
+
+
+def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
+    return float(head[:8].strip() in _VERSION_4)
+
+
+@contextmanager
+def _read(path: Path) -> Generator[FrameLog]:
+    if not is_installed("asammdf"):
+        raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf")
+    with confined(f"{__name__}:open_mf4")(path) as log:
+        yield log
+
+
+FORMAT = Format("mf4", "MF4", (".mf4",), _sniff, FrameReader(_read), packed=True)

@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bus.decoded_topics import JOINT_TOPIC
-from ..common.arrays import NS, FloatArray, IntArray
-from ..common.console import progress
-from ..common.errors import DataError, MissingChannelError, UsageError, some_names
-from ..common.files import check_stop, part_folder
-from ..common.process import StopRequest
-from ..log.read.session import Session
-from ..robot.bus_map import SESSION_UNIT
-from .column_blocks import arrow
-from .export import ExportReport
-from .lerobot_import import FEATURES
+from ....bus.decoded_topics import JOINT_TOPIC
+from ....common.arrays import NS, FloatArray, IntArray
+from ....common.console import progress
+from ....common.errors import DataError, MissingChannelError, UsageError, some_names
+from ....common.files import check_stop, part_folder
+from ....common.process import StopRequest
+from ....log.read.session import Session
+from ....robot.bus_map import SESSION_UNIT
+from ...column_blocks import arrow
+from ...reports import ExportReport
+from .importing import FEATURES
 
 VERSION = "v3.0"
 MARKER = Path("meta", "info.json")

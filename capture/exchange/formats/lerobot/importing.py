@@ -21,20 +21,21 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import NS
-from ..common.errors import ImportFormatError, LogError, UsageError, some_names
-from ..common.process import StopRequest
-from ..common.untrusted_text import read_json
-from ..log.read.facts import TIMES_FROM_FPS
-from ..robot.bus_map import SESSION_UNIT
-from ..robot.description import numbered
-from ..robot.model import Quantity, Robot
-from .can_import import FLOAT32, ImportReport, file_digest
-from .column_blocks import Block, refuse, rows_of_block, spread
-from .column_map import STATES, ColumnMap, MappedColumn
-from .parquet_blocks import ParquetReader, vectors_of
-from .table_import import TableSet, import_tables
-from .tables import TableFile
+from ....common.arrays import NS
+from ....common.errors import ImportFormatError, LogError, UsageError, some_names
+from ....common.process import StopRequest
+from ....common.untrusted_text import read_json
+from ....log.read.facts import TIMES_FROM_FPS
+from ....robot.bus_map import SESSION_UNIT
+from ....robot.description import numbered
+from ....robot.model import Quantity, Robot
+from ...column_blocks import Block, refuse, rows_of_block, spread
+from ...column_map import STATES, ColumnMap, MappedColumn
+from ...parquet_blocks import ParquetReader, vectors_of
+from ...reports import ImportReport
+from ...session_import import FLOAT32, file_digest
+from ...table_file import TableFile
+from ...table_import import TableSet, import_tables
 
 FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 """Feature to what it is of each joint."""
@@ -92,11 +93,6 @@ class LeRobotDataset:
         if not paths:
             raise ImportFormatError(self.folder, "has no frames in data/*/*.parquet")
         return dict(sorted(paths.items()))
-
-
-def is_lerobot(folder: Path) -> bool:
-    """Return whether a folder is a LeRobot dataset."""
-    return (folder / "meta" / "info.json").is_file()
 
 
 def open_lerobot(folder: Path) -> LeRobotDataset:

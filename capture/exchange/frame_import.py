@@ -1,176 +1,38 @@
-"""Imported sessions, and the import of CAN logs: frames kept raw, and what the bus map names."""
+"""Logs of CAN frames into sessions: frames kept raw, and what the bus map names."""
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from zstandard import STRATEGY_FAST, ZstdCompressionParameters
 
 from ..bus.decoded_topics import DecodedTopics, TopicMessages
 from ..bus.decoders import open_decoder
 from ..bus.decoding import DecodedSignals, FrameTally
-from ..common.arrays import NS, IntArray
-from ..common.console import progress, refuse_existing
+from ..common.arrays import IntArray
+from ..common.console import progress
 from ..common.errors import ImportFormatError
-from ..common.files import part_file
-from ..common.process import StopRequest, helpers, threads_or_default
-from ..log.file.log_file import keep_freed
+from ..common.process import StopRequest
 from ..log.health.bus_tally import undecoded
-from ..log.mcap.writer import Compression
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
 from ..log.write.channels import FrameChannel
-from ..log.write.mcap_sink import McapSink
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
-from .can_logs import log_suffix, open_frame_log
-from .frame_log import DIRECTIONS_KEY, FrameLog, LogBlock
-
-LEVEL: Compression = 2
-"""Of compression: a third less time than level 3 for a few per cent more bytes."""
-
-FLOAT32: Compression = ZstdCompressionParameters(
-    window_log=20,
-    hash_log=12,
-    chain_log=12,
-    search_log=1,
-    min_match=5,
-    target_length=1,
-    strategy=STRATEGY_FAST,
-    write_checksum=True,
-)
-"""Of messages whose numbers had single precision: those of neighbours share few bytes, so that a
-table of matches in the nearest cache finds as many. A quarter to a third less time than level 2,
-for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
-
-_REUSED = 1 << 24
-"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and
-getting a new page from the system takes longer than filling it."""
+from .frame_log import DIRECTIONS_KEY, LATEST_NS, FrameLog, LogBlock
+from .packed import format_suffix
+from .reports import ImportReport
+from .session_import import imported_session
 
 _BATCH_NS = 50_000_000  # one message of raw frames spans at most this
 
 
-@dataclass
-class ImportReport:
-    """What an import did.
-
-    Attributes:
-        start_ns: First sample or frame [Unix ns].
-        end_ns: Last sample or frame [Unix ns].
-        frames: Number of raw frames kept; None where the log has none.
-        samples: Topic to number of messages.
-        problems: What is missing or wrong, one sentence each.
-        notes: What is in order and worth knowing, one sentence each.
-        complete: False if the import was stopped on request.
-    """
-
-    source: Path
-    output: Path
-    robot: str
-    start_ns: int = 0
-    end_ns: int = 0
-    frames: int | None = None
-    samples: dict[str, int] = field(default_factory=dict[str, int])
-    problems: list[str] = field(default_factory=list[str])
-    notes: list[str] = field(default_factory=list[str])
-    complete: bool = True
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last sample or frame [s]."""
-        return (self.end_ns - self.start_ns) / NS
-
-    @property
-    def verdict(self) -> str:
-        """``good``, or ``degraded`` where something is missing or wrong."""
-        return "good" if self.complete and not self.problems else "degraded"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the report as plain JSON values."""
-        return {
-            "source": str(self.source),
-            "output": str(self.output),
-            "robot": self.robot,
-            "duration_s": self.duration_s,
-            "frames": self.frames,
-            "messages": self.samples,
-            "verdict": self.verdict,
-            "problems": self.problems,
-            "notes": self.notes,
-            "complete": self.complete,
-        }
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def digest_of(files: Sequence[Path]) -> str:
-    """Return the SHA-256 of one file, or of the names and digests of several."""
-    if len(files) == 1:
-        return file_digest(files[0])
-    parts = "".join(f"{path.name} {file_digest(path)}\n" for path in files)
-    return hashlib.sha256(parts.encode()).hexdigest()
-
-
-@contextmanager
-def imported_session(
+def import_frames(
     source: Path,
-    output: Path,
-    robot: Robot | None,
-    *,
-    epoch_ns: int,
-    facts: Mapping[str, str],
-    force: bool,
-    digest: Callable[[], str] | None = None,
-    compression: Compression = LEVEL,
-) -> Generator[SessionWriter]:
-    """Write an imported session, which appears under its name only when it is whole.
-
-    The same log gives the same session id and, with the same robot, the same bytes: no clock and
-    no path of this machine enters the file.
-
-    Args:
-        robot: The robot that made the log, if it is known.
-        epoch_ns: Time of its first sample [Unix ns].
-        facts: For the session's metadata.
-        digest: Returns that of the log, where that is more than the file ``source``.
-        compression: Of the messages.
-
-    Raises:
-        OutputExistsError: If the output is there and ``force`` is not given.
-        LogWriteError: If it can't be written; nothing is left behind then.
-    """
-    refuse_existing(output, force=force)
-    keep_freed(_REUSED)
-    of_log = file_digest(source) if digest is None else digest()
-    with (
-        part_file(output) as part,
-        helpers(threads_or_default(None)) as pool,
-        SessionWriter(
-            part,
-            session_id=f"import-{of_log[:16]}",
-            epoch_ns=epoch_ns,
-            robot=robot,
-            clock={"log": str(robot.clock)} if robot else {},
-            metadata={"source": source.name, "source.sha256": of_log, **facts},
-            sink=McapSink(part, force=True, compression=compression, helpers=pool),
-        ) as writer,
-    ):
-        yield writer
-
-
-def import_can(
-    source: Path,
+    log: FrameLog,
     output: Path,
     robot: Robot,
     *,
@@ -185,7 +47,8 @@ def import_can(
     (:mod:`.capture.bus.decoded_topics`); each sample keeps the time of its frame.
 
     Args:
-        source: The log: candump, ASC, BLF, TRC, python-can CSV or SQLite, MF4.
+        source: The file, which the session names.
+        log: Its frames.
         robot: The robot that made the log.
         bus: The bus to decode; the first one in the log if None.
         stop: Ends the import early, with a whole file of what was read so far.
@@ -196,14 +59,14 @@ def import_can(
         LogWriteError: If the output can't be written.
     """
     report = ImportReport(source, output, robot.name, frames=0)
-    with open_frame_log(source) as log, progress(f"import {source.name}", 1.0) as bar:
-        blocks = iter(log.blocks)
+    with progress(f"import {source.name}", 1.0) as bar:
+        blocks = _stampable(log)
         first = next(blocks, None)
         if first is None:
             raise ImportFormatError(source, "; ".join(["holds no CAN frames", *log.problems[:1]]))
         chosen = bus or log.buses[int(first.bus[0])]
         facts = {
-            "import.format": log_suffix(source).removeprefix("."),
+            "import.format": format_suffix(source).removeprefix("."),
             "import.time": log.time,
             DIRECTIONS_KEY: "recorded" if log.directions else "none",
             "import.bus": chosen,
@@ -226,6 +89,23 @@ def import_can(
                 )
             writer.set_verdict(report.verdict, [*report.problems, *report.notes])
     return report
+
+
+def _stampable(log: FrameLog) -> Iterator[LogBlock]:
+    """Yield the blocks; leave out, and count, the frames whose time no stamp can hold."""
+    early = late = 0
+    for block in log.blocks:
+        t_ns = block.times_ns()
+        kept = block[(t_ns >= 0) & (t_ns < LATEST_NS)]
+        early += np.count_nonzero(t_ns < 0)
+        late += np.count_nonzero(t_ns >= LATEST_NS)
+        if len(kept):
+            yield kept
+    for count, when in ((early, "before 1970"), (late, "after 2038")):
+        if count:
+            log.problems.append(
+                f"{count} frames are stamped {when}, which no stamp can hold: left out"
+            )
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from typing import Any, cast
 
 from mcap.records import Channel
 
-from ..common.errors import DataError, UsageError, some_names
-from ..common.files import part_folder
-from ..common.process import StopRequest
-from ..log.edited_log import EditedLog, RawLog
-from ..log.file.bag_metadata import METADATA, is_rosbag2
-from ..log.messages.definitions import is_latched
-from .export import ExportReport
+from ....common.errors import DataError, UsageError, some_names
+from ....common.files import part_folder
+from ....common.process import StopRequest
+from ....log.edited_log import EditedLog, RawLog
+from ....log.file.bag_metadata import METADATA, is_rosbag2
+from ....log.messages.definitions import is_latched
+from ...reports import ExportReport
 
 MARKER = Path(METADATA)
 """The file by which a folder is a bag."""

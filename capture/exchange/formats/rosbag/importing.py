@@ -17,37 +17,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import NS
-from ..common.console import progress, refuse_existing
-from ..common.errors import DataError, ImportFormatError, MissingChannelError, some_names
-from ..common.files import check_stop
-from ..common.process import StopRequest
-from ..log.cut import cut_log
-from ..log.edited_log import RawLog
-from ..log.file.bag import check_room, is_bag
-from ..log.file.bag_metadata import is_rosbag2
-from ..log.mcap.chunk import LAST_NS
-from ..log.messages.definitions import TRAJECTORY, is_of_contract
-from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
-from ..log.read.joint_topics import COMMAND_TOPIC, HOW_TO_CHOOSE, RESPONSE_TOPIC, JointTopics
-from ..log.read.sample_times import MOST_JOINTS
-from ..log.read.session import Session
-from ..log.write.channels import JointStateChannel
-from ..log.write.writer import SessionWriter
-from .can_import import ImportReport, digest_of, imported_session
+from ....common.arrays import NS
+from ....common.console import progress, refuse_existing
+from ....common.errors import DataError, ImportFormatError, MissingChannelError, some_names
+from ....common.files import check_stop
+from ....common.process import StopRequest
+from ....log.cut import cut_log
+from ....log.edited_log import RawLog
+from ....log.file.bag import check_room, is_bag
+from ....log.mcap.chunk import LAST_NS
+from ....log.messages.definitions import TRAJECTORY, is_of_contract
+from ....log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
+from ....log.read.joint_topics import COMMAND_TOPIC, HOW_TO_CHOOSE, RESPONSE_TOPIC, JointTopics
+from ....log.read.sample_times import MOST_JOINTS
+from ....log.read.session import Session
+from ....log.write.channels import JointStateChannel
+from ....log.write.writer import SessionWriter
+from ...reports import ImportReport
+from ...session_import import digest_of, imported_session
 
 _WINDOW_NS = 20 * NS
 _MOST_WINDOWS = 2000
 _MOST_NAMED = 20
 _COPYING = 0.4
 """Share of the progress that is the copy of a bag that isn't a plain MCAP file."""
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a path is a recording of ROS: an MCAP, .db3 or .bag file, or a folder of rosbag2."""
-    if path.is_dir():
-        return is_rosbag2(path)
-    return path.suffix.lower() in {".mcap", ".db3", ".bag"}
 
 
 def import_bag(

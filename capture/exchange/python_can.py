@@ -1,61 +1,38 @@
-"""Logs of CAN frames by python-can; run in a child process (:mod:`.capture.exchange.can_logs`).
+"""Logs of CAN frames read and written by python-can.
 
 python-can hands out times as floating-point seconds, which at today's Unix time resolve 0.24 us;
 they are rounded to 1 us, the resolution of the formats it reads.
-
-Vector BLF files: python-can's reader, with the sizes that a file claims checked against it.
-
-A file is a header and objects, most of them containers of compressed objects. A damaged size makes
-python-can read the same object for ever, or reserve as much memory as a length field can state.
 """
 
 from __future__ import annotations
 
-import gzip
 import io
 import logging
 import os
+import re
 import sqlite3
 import struct
 import zlib
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import Any
 
-from can import BLFReader, Message
-from can.io.blf import (
-    LOG_CONTAINER,
-    LOG_CONTAINER_STRUCT,
-    NO_COMPRESSION,
-    OBJ_HEADER_BASE_STRUCT,
-    ZLIB_DEFLATE,
-    BLFParseError,
-)
+from can import Message
+from can.io.blf import BLFParseError
+from can.io.generic import MessageReader, MessageWriter
 
-from ..common.databases import check_pages, open_database
+from ..common.arrays import NS
 from ..common.errors import ImportFormatError, raised_as
 from ..log.messages import frames as wire
-from .frame_log import FrameLog, FrameRow, blocks_of
-
-if TYPE_CHECKING:
-    from can.io.generic import MessageReader
-
-
-LARGEST_CONTAINER = 64 << 20
-"""Bytes that a container may expand to; Vector's tools and python-can write 128 KiB."""
-
-_FILE_HEADER_SIZE = 144
-_LARGEST_HEADER = 1 << 16
-_BASE_SIZE = OBJ_HEADER_BASE_STRUCT.size
-_SIZE_AT = 8
-"""Offset of an object's size in its header."""
+from .frame_export import WriteFrames
+from .frame_log import FrameFacts, FrameLog, FrameRow, LogBlock, blocks_of
 
 _MOST_TEXTS = 20  # different warnings of a library that are reported
 _LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
-_WITHOUT_DIRECTIONS = (".csv", ".db")
 _LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
 _MOST_BYTES = 64
+_NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
 _READ_ERRORS = (
     ValueError,  # text that is no number, a wrong file version
@@ -73,130 +50,38 @@ _READ_ERRORS = (
 """What python-can's readers raise on a damaged file."""
 
 
-class CheckedBLFReader(BLFReader):
-    """Messages of a BLF file; raises BLFParseError where a size can't be right."""
-
-    file: BinaryIO
-
-    def __init__(self, path: Path) -> None:
-        """Open a file and read its header.
-
-        Raises:
-            OSError: If it can't be read.
-            BLFParseError: If it is no BLF file.
-        """
-        opened = gzip.open if path.suffix.lower() == ".gz" else open
-        with ExitStack() as stack:
-            stream = stack.enter_context(opened(path, "rb"))
-            _check_header(stream.read(_FILE_HEADER_SIZE))
-            stream.seek(0)
-            super().__init__(cast("BinaryIO", stream))
-            stack.pop_all()  # the reader closes it
-
-    def __iter__(self) -> Iterator[Message]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Yield the messages of all containers."""
-        while header := self.file.read(_BASE_SIZE):
-            at = self.file.tell() - len(header)
-            signature, _, _, size, kind = OBJ_HEADER_BASE_STRUCT.unpack(header)
-            if signature != b"LOBJ" or size < _BASE_SIZE:
-                raise BLFParseError(f"no object at byte {at}")
-            data = self.file.read(min(size - _BASE_SIZE, LARGEST_CONTAINER))
-            self.file.read(size % 4)  # padding
-            if kind == LOG_CONTAINER:
-                yield from self._parse_container(_expanded(data, at))
-        self.stop()
-
-    def _parse_data(self, data: bytes) -> Iterator[Message]:
-        at = data.find(b"LOBJ", 0, 8)
-        while 0 <= at <= len(data) - _BASE_SIZE:
-            (size,) = struct.unpack_from("<I", data, at + _SIZE_AT)
-            if size < _BASE_SIZE:
-                raise BLFParseError(f"an object in a container states a size of {size} bytes")
-            at = data.find(b"LOBJ", at + size, at + size + 8)
-        return super()._parse_data(data)
-
-
-def _check_header(header: bytes) -> None:
-    size = int.from_bytes(header[4:8], "little")
-    if header[:4] != b"LOGG" or not _FILE_HEADER_SIZE <= size <= _LARGEST_HEADER:
-        raise BLFParseError("not a BLF file, or its header is damaged")
-
-
-def _expanded(container: bytes, at: int) -> bytes:
-    method, _ = LOG_CONTAINER_STRUCT.unpack_from(container)
-    data = container[LOG_CONTAINER_STRUCT.size :]
-    if method == NO_COMPRESSION:
-        return data
-    if method != ZLIB_DEFLATE:
-        raise BLFParseError(f"the container at byte {at} has an unknown compression, {method}")
-    expanded = zlib.decompressobj().decompress(data, LARGEST_CONTAINER + 1)
-    if len(expanded) > LARGEST_CONTAINER:
-        raise BLFParseError(
-            f"the container at byte {at} expands to more than {LARGEST_CONTAINER >> 20} MiB"
-        )
-    return expanded
-
-
 @contextmanager
-def open_log(path: Path, suffix: str) -> Generator[FrameLog]:
-    """Open a log of CAN frames that python-can reads.
+def python_can_log(
+    path: Path,
+    open_reader: Callable[[], MessageReader],
+    *,
+    directions: bool = True,
+    corrected: Callable[[Message], Message] | None = None,
+) -> Generator[FrameLog]:
+    """Open a log that python-can reads.
 
     Args:
-        suffix: Of its format, in lower case.
+        open_reader: Returns its reader, which is stopped at the end.
+        directions: Whether the format has directions.
+        corrected: Applied to each message.
 
     Raises:
-        ImportFormatError: If its format isn't that of its suffix; also while its blocks are taken.
+        ImportFormatError: If its format isn't that of its reader; also while its blocks are taken.
     """
     problems: list[str] = []
-    with _noted("can", problems):
-        reader = _reader(path, suffix)
+    with (
+        _noted("can", problems),
+        raised_as(ImportFormatError, path, "can't be read", *_READ_ERRORS),
+    ):
+        reader = open_reader()
+    log = FrameLog(iter(()), [], directions, "as recorded, rounded to 1 us", problems)
+    messages = _messages(path, reader)
+    rows = _rows(path, map(corrected, messages) if corrected else messages, log)
+    log.blocks = blocks_of(rows, lambda: _read_part(reader))
     try:
-        yield _python_can_log(path, reader, suffix, problems)
+        yield log
     finally:
         reader.stop()
-
-
-def _reader(path: Path, suffix: str) -> MessageReader:
-    from can import LogReader
-
-    with raised_as(ImportFormatError, path, "can't be read", *_READ_ERRORS):
-        if suffix == ".blf":
-            return CheckedBLFReader(path)
-        if suffix == ".db":
-            _check_database(path)
-        return LogReader(path)
-
-
-def _check_database(path: Path) -> None:
-    """Refuse what isn't plain, and data that is a number: it would count as a number of bytes."""
-    with open_database(path, ["messages"], immutable=False) as base:
-        check_pages(base)
-        number = "typeof(data) IN ('integer', 'real')"
-        count = base.execute(f"SELECT count(*) FROM messages WHERE {number}").fetchone()[0]  # noqa: S608
-    if count:
-        raise ValueError(f"{count} rows have a number as data")
-
-
-def _python_can_log(
-    path: Path, reader: MessageReader, suffix: str, problems: list[str]
-) -> FrameLog:
-    log = FrameLog(
-        blocks=iter(()),
-        buses=[],
-        directions=suffix not in _WITHOUT_DIRECTIONS,
-        time="as recorded, rounded to 1 us",
-        problems=problems,
-    )
-    messages = _messages(path, reader)
-    if suffix == ".asc":
-        messages = map(_with_length_code, messages)
-    log.blocks = blocks_of(_rows(path, messages, log), lambda: _read_part(reader))
-    claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
-    if suffix == ".blf" and claimed > path.stat().st_size:
-        log.problems.append(
-            f"the file is cut short: {path.stat().st_size} bytes of the {claimed} in its header"
-        )
-    return log
 
 
 def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
@@ -291,15 +176,6 @@ def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow
     )
 
 
-def _with_length_code(message: Message) -> Message:
-    """Correct the length code of an ASC frame, which the reader decodes as CAN FD's: 9 as 12."""
-    from can.util import len2dlc
-
-    if not message.is_fd and not message.is_remote_frame:
-        message.dlc = len2dlc(message.dlc)
-    return message
-
-
 class _Noting(logging.Handler):
     """Keeps the warnings of a logger: each text once, with how often it came."""
 
@@ -335,3 +211,50 @@ def _noted(name: str, problems: list[str]) -> Generator[None]:
     finally:
         trc.setLevel(level)
         logger.removeHandler(handler)
+
+
+def channel_numbers(buses: Sequence[str]) -> list[int]:
+    """Return numbers for buses in formats that have no names, counted from 0 as python-can does.
+
+    Returns:
+        N for a bus ``canN``, so that an import names it the same; the lowest free number for any
+        other.
+    """
+    matches = [_NUMBERED.fullmatch(name) for name in buses]
+    taken = {int(match[1]) for match in matches if match}
+    free = (number for number in range(len(buses) + len(taken)) if number not in taken)
+    return [int(match[1]) if match else next(free) for match in matches]
+
+
+def notes_on_buses(facts: FrameFacts) -> Iterator[str]:
+    """Report changed bus names and missing directions."""
+    for name, number in zip(facts.buses, channel_numbers(facts.buses), strict=True):
+        if name != f"can{number}":
+            yield f"it has no names: bus {name} is channel {number + 1}"
+    if not facts.directions:
+        yield "no directions were recorded: all frames are written as received"
+
+
+def frames_to(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFrames:
+    """Return what hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
+    channels = channel_numbers(facts.buses)
+
+    def write(block: LogBlock) -> None:
+        for row in block.rows():
+            message = Message(
+                timestamp=(row.t_ns - start_s * NS + 0.5) / NS,  # python-can cuts to whole ns
+                arbitration_id=row.id_flags & wire.ID_MASK,
+                is_extended_id=bool(row.id_flags & wire.EXTENDED_FLAG),
+                is_remote_frame=bool(row.id_flags & wire.REMOTE_FLAG),
+                is_error_frame=bool(row.id_flags & wire.ERROR_FLAG),
+                channel=channels[row.bus],
+                dlc=row.length,
+                data=row.data,
+                is_rx=row.way != wire.DIR_TX,
+                is_fd=row.is_fd,
+                bitrate_switch=bool(row.fd_flags & wire.FD_BRS),
+                error_state_indicator=bool(row.fd_flags & wire.FD_ESI),
+            )
+            writer(message)
+
+    return write

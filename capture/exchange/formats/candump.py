@@ -16,16 +16,32 @@ Times are kept as integers, so what is read here and written again is the same t
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
+from typing import TextIO
 
-from ..common.arrays import NS
-from ..common.errors import ImportFormatError
-from ..log.mcap.chunk import LAST_NS
-from ..log.messages import frames as wire
-from ..log.messages.frames import identifier_text
-from .frame_log import FrameLog, FrameRow, LogBlock, blocks_of
+from ...common.arrays import NS
+from ...common.errors import ImportFormatError, raised_as
+from ...log.mcap.chunk import LAST_NS
+from ...log.messages import frames as wire
+from ...log.messages.frames import FrameArray, identifier_text
+from ..frame_export import FrameWriter, WriteFrames
+from ..frame_log import (
+    FrameFacts,
+    FrameLog,
+    FrameRow,
+    LogBlock,
+    blocks_of,
+    is_error,
+    is_remote,
+    possible,
+    shorten,
+)
+from ..frame_reader import FrameReader
+from ..packed import open_packed_text
+from .format import Format
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
@@ -33,6 +49,23 @@ _LINE = re.compile(
     r"#([0-9A-Fa-f])((?:[0-9A-Fa-f]{2}){0,64}))"
     r"(?:\s+([RTrt]))?\s*"
 )
+
+
+def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
+    line, end, _ = head.partition(b"\n")
+    return float(bool(end) and _LINE.fullmatch(line.decode("ascii", "replace")) is not None)
+
+
+@contextmanager
+def _read(path: Path) -> Generator[FrameLog]:
+    with open_packed_text(path, encoding="ascii", errors="replace") as stream:
+        yield read_candump(path, _lines(path, stream))
+
+
+def _lines(path: Path, stream: TextIO) -> Iterator[str]:
+    """Yield the lines of a text; errors name the file."""
+    with raised_as(ImportFormatError, path, "can't be read", OSError, EOFError):  # a damaged .gz
+        yield from stream
 
 
 def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
@@ -137,3 +170,29 @@ def _identifier(id_flags: int) -> str:
 def _quoted(line: str) -> str:
     text = line.rstrip("\n")
     return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+def _kept(block: LogBlock) -> FrameArray:
+    """Keep everything but data of remote frames and further flags of error frames."""
+    frames = possible(block)
+    frames["id_flags"][is_error(frames)] &= wire.ID_MASK | wire.ERROR_FLAG
+    shorten(frames, is_remote(frames))
+    return frames
+
+
+@contextmanager
+def _write(path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
+    options = {"directions": facts.directions, "nanoseconds": facts.nanoseconds}
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
+        yield lambda block: stream.writelines(candump_lines(block, facts.buses, **options))
+
+
+FORMAT = Format(
+    "candump",
+    "candump trace",
+    (".log",),
+    _sniff,
+    FrameReader(_read),
+    FrameWriter("candump -L", _kept, lambda _: (), _write),
+    packed=True,
+)

@@ -1,22 +1,18 @@
-"""Arrays of files of NumPy (``.npz``), MATLAB (``.mat``) and PyTorch (``.pt``), in a child process.
+"""PyTorch's ``.pt``: tensors, read without running what the file's pickle names.
 
-A ``.pt`` file is read without running what its pickle names. It is a zip: ``*/data.pkl`` names
-tensors by storage, shape and stride, ``*/data/KEY`` holds the raw numbers. The pickle's opcodes are
-followed by a small machine of its own, which knows dictionaries, lists, numbers, texts and the
-rebuilding of tensors; what a pickle would call besides is not run: its result is an object without
-a value.
+The file is a zip: ``*/data.pkl`` names tensors by storage, shape and stride, ``*/data/KEY`` holds
+the raw numbers. The pickle's opcodes are followed by a small machine of its own, which knows
+dictionaries, lists, numbers, texts and the rebuilding of tensors; what a pickle would call besides
+is not run: its result is an object without a value.
 """
 
 from __future__ import annotations
 
-import io
 import math
 import pickletools
 import sys
 import zipfile
-import zlib
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -24,11 +20,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.confined import Confined
-from ..common.confined_child import Send
-from ..common.errors import ImportFormatError, raised_as
-from ..common.packets import Packet, is_plain
-from .column_blocks import MOST_BYTES, UNZIPPING, check_cells, read_entry, refuse
+from ...common.errors import ImportFormatError, raised_as
+from ..array_table import confined_arrays
+from ..column_blocks import MOST_BYTES, UNZIPPING, read_entry, refuse
+from ..table_format import TableReader
+from .format import Format
 
 _MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
 _DTYPES = {
@@ -51,8 +47,12 @@ _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _PUT = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET = {"GET", "BINGET", "LONG_BINGET"}
 
-_COMPRESSED, _PIECE = 15, 1 << 16  # of .mat
-_NPY_HEADER = 1 << 17  # bytes
+_ENTRY_NAME = slice(30, 4096)
+"""Where the name of a zip's first entry is."""
+
+
+def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
+    return 0.9 * (head.startswith(b"PK") and b"data.pkl" in head[_ENTRY_NAME])
 
 
 @dataclass(frozen=True)
@@ -72,28 +72,6 @@ class _Tensor:
     offset: int
     shape: tuple[int, ...]
     stride: tuple[int, ...]
-
-
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file by its suffix; one that is no array of numbers holds None.
-
-    They are not to be written.
-
-    Raises:
-        ImportFormatError: If it is damaged, of another version, or takes too much memory or time.
-    """
-    with closing(Confined(ImportFormatError)) as reader:
-        packet = reader.call(f"{__name__}:parse", path)
-    none = np.array(None)
-    return {name: packet.arrays.get(name, none) for name in packet.facts["names"]}
-
-
-def parse(path: Path, send: Send) -> None:
-    """Send the arrays of a file; runs in the child process."""
-    readers = {".npz": read_npz, ".mat": read_mat}
-    arrays = readers.get(path.suffix.lower(), read_tensors)(path)
-    plain = {name: array for name, array in arrays.items() if is_plain(array)}
-    send(Packet({"names": list(arrays)}, plain))
 
 
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
@@ -287,91 +265,10 @@ class _Storages:
         return self._read[key]
 
 
-def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a ``.npz`` file but those of objects.
-
-    Raises:
-        ImportFormatError: If it is damaged or expands too far.
-    """
-    caught = (OSError, ValueError, RuntimeError, *UNZIPPING)
-    with (
-        raised_as(ImportFormatError, path, "can't be read as .npz", *caught),
-        zipfile.ZipFile(path) as archive,
-    ):
-        size = sum(info.file_size for info in archive.infolist())
-        if size > MOST_BYTES:
-            refuse(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
-        check_cells(path, size // 8)
-        return {
-            info.filename.removesuffix(".npy"): array
-            for info in archive.infolist()
-            if (array := _npy(read_entry(archive, info), info.filename)) is not None
-        }
-
-
-def _npy(data: bytearray, name: str) -> NDArray[Any] | None:
-    """Return one array, None for objects: those would be unpickled."""
-    stream = io.BytesIO(memoryview(data)[:_NPY_HEADER])
-    try:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-        shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
-    except Exception as error:  # it is a Python expression: its parser's errors have many bases
-        raise ValueError(f"{name} has no valid header: {error}") from error
-    if dtype.hasobject:
-        return None
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * dtype.itemsize > len(data) - stream.tell():
-        raise ValueError(f"{name} declares shape {shape}, more than it holds")
-    flat = np.frombuffer(data, dtype, count, stream.tell()) if count else np.zeros(0, dtype)
-    return flat.reshape(shape, order="F" if fortran else "C")
-
-
-def read_mat(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of numbers of a ``.mat`` file, up to version 7.
-
-    Raises:
-        ImportFormatError: If it is damaged, of another version or expands too far.
-    """
-    from scipy.io import loadmat, whosmat
-
-    # scipy raises whatever a damaged file leads to
-    with raised_as(ImportFormatError, path, "can't be read as .mat", Exception):
-        with path.open("rb") as stream:
-            start = stream.read(128)
-        if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
-            refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
-        _check_mat(path)
-        listed = whosmat(path)
-        size = sum(8 * math.prod(shape) for _, shape, _ in listed)
-        if size > MOST_BYTES:
-            refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
-        check_cells(path, size // 8)
-        numeric = ("double", "single", "logical", "int", "uint")
-        names = [name for name, _, kind in listed if kind.startswith(numeric)]
-        arrays = loadmat(path, variable_names=names) if names else {}
-        return {name: arrays[name] for name in names if isinstance(arrays.get(name), np.ndarray)}
-
-
-def _check_mat(path: Path) -> None:
-    """Refuse a file of which an element expands too far; what the elements declare may be less.
-
-    Layout: MAT-File Format, "Level 5 MAT-Files": tags of type and size [byte], and zlib streams.
-    """
-    left = MOST_BYTES
-    with path.open("rb") as stream:
-        order = "little" if stream.read(128)[126:128] == b"IM" else "big"
-        while len(tag := stream.read(8)) == 8:
-            kind, size = (int.from_bytes(part, order) for part in (tag[:4], tag[4:]))
-            if kind != _COMPRESSED:
-                stream.seek(size, io.SEEK_CUR)
-                continue
-            packed, end = zlib.decompressobj(), stream.tell() + size
-            while left > 0 and not packed.eof and (some := stream.read(min(_PIECE, size))):
-                size -= len(some)
-                while left > 0 and some:
-                    left -= len(packed.decompress(some, _PIECE))
-                    some = packed.unconsumed_tail
-            if left <= 0:
-                refuse(path, f"expands to more than {MOST_BYTES} bytes")
-            stream.seek(end)
+FORMAT = Format(
+    "pt",
+    "PyTorch tensors (.pt)",
+    (".pt", ".pth"),
+    _sniff,
+    TableReader(confined_arrays(f"{__name__}:read_tensors", "pt")),
+)

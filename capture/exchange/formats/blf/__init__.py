@@ -1,0 +1,1 @@
+"""Vector BLF: binary traces of CAN buses."""

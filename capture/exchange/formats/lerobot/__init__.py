@@ -1,0 +1,1 @@
+"""LeRobot datasets: episodes of commands and states, for learning."""

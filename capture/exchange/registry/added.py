@@ -1,0 +1,86 @@
+"""Formats that other packages add by entry points (``docs/reference/formats.md``)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, cast
+
+from ...common.errors import UsageError
+from ..formats.format import Format
+
+ENTRY_POINTS = "undulog.formats"
+"""Group of the entry points."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]*")
+_SUFFIX = re.compile(r"\.[a-z0-9_-]+")
+
+
+@cache
+def added_formats(taken: Collection[str] = ()) -> tuple[Format, ...]:
+    """Return the formats that other packages add, by name.
+
+    Args:
+        taken: Names that they can't have.
+
+    Raises:
+        UsageError: If one can't be loaded, is no format, or has a name that is taken.
+    """
+    names = set(taken)
+    added: list[Format] = []
+    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
+        form = _loaded(point)
+        if form.name in names:
+            raise UsageError(f"{_whose(point)} has a name that is taken; give it another one")
+        names.add(form.name)
+        added.append(form)
+    return tuple(added)
+
+
+def _loaded(point: EntryPoint) -> Format:
+    try:
+        form: object = point.load()
+    except Exception as error:
+        raise UsageError(f"{_whose(point)} can't be loaded: {error}; remove its package") from error
+    if not isinstance(form, Format):
+        raise UsageError(f"{_whose(point)} is no undulog.capture.exchange.formats.format.Format")
+    if form.name != point.name or not _NAME.fullmatch(form.name):
+        raise UsageError(
+            f"{_whose(point)}: its 'name' has to be that of its entry point, of small letters, "
+            "digits, - and _"
+        )
+    if fault := _fault(vars(form)):
+        raise UsageError(f"{_whose(point)}: {fault}")
+    return form
+
+
+def _fault(fields: dict[str, Any]) -> str:
+    """Return which field is wrong and what it has to be; empty if none is."""
+    title, suffixes, read, write = (fields[n] for n in ("title", "suffixes", "read", "write"))
+    are_suffixes = isinstance(suffixes, tuple) and all(map(_is_suffix, cast("Any", suffixes)))
+    faults = {
+        "its 'title' has to be a text": not (isinstance(title, str) and title),
+        "its 'suffixes' have to be a tuple of texts such as '.abc', in small letters": (
+            not are_suffixes
+        ),
+        "its 'sniff' has to be a function of bytes and path": not callable(fields["sniff"]),
+        "its 'read' has to be a reader": not _is_part(read, "into_session"),
+        "its 'write' has to be a writer": not _is_part(write, "out_of_session"),
+        "it needs 'read' or 'write'": read is write is None,
+        "its 'write' needs a suffix": write is not None and not suffixes,
+    }
+    return next((text for text, is_wrong in faults.items() if is_wrong), "")
+
+
+def _is_suffix(suffix: object) -> bool:
+    return isinstance(suffix, str) and _SUFFIX.fullmatch(suffix) is not None
+
+
+def _is_part(part: object, method: str) -> bool:
+    return part is None or callable(getattr(part, method, None))
+
+
+def _whose(point: EntryPoint) -> str:
+    return f"the format {point.name!r} ({point.value})"

@@ -1,0 +1,203 @@
+"""The table of formats, and the choice of one for a file that is read or written."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...common.errors import DataError, ImportFormatError, UndulogError, UsageError
+from ...common.files import check_regular, is_file, why_no_file
+from ...common.looks import has_signature, looks_like
+from ..formats import (
+    asc,
+    can_csv,
+    can_db,
+    can_msgs,
+    candump,
+    csv_table,
+    foxglove,
+    mat,
+    mf4,
+    npz,
+    parquet,
+    plotjuggler,
+    torch_tensors,
+    trc,
+    tum,
+)
+from ..formats.blf import format as blf
+from ..formats.format import Format, Reader, Writer
+from ..formats.lerobot import format as lerobot
+from ..formats.rosbag import format as rosbag
+from ..packed import format_suffix, is_packed
+from ..table_format import TableReader, TableWriter, WideTableWriter
+from .added import added_formats
+from .table_folder import table_folder
+
+if TYPE_CHECKING:
+    from ..table_file import TableFile
+
+FORMATS: tuple[Format, ...] = (
+    candump.FORMAT,
+    blf.FORMAT,
+    asc.FORMAT,
+    can_msgs.FORMAT,
+    trc.FORMAT,
+    can_db.FORMAT,
+    mf4.FORMAT,
+    csv_table.FORMAT,
+    can_csv.FORMAT,
+    parquet.FORMAT,
+    npz.FORMAT,
+    mat.FORMAT,
+    torch_tensors.FORMAT,
+    rosbag.FORMAT,
+    lerobot.FORMAT,
+    tum.FORMAT,
+    foxglove.FORMAT,
+    plotjuggler.FORMAT,
+)
+"""The formats of this package; of those that fit a file alike, the first is taken."""
+
+WIDE = "wide"
+"""What ``--to`` names for a table with a column for each joint and quantity."""
+
+_HEAD = 1 << 16
+"""Bytes of a file that are looked at."""
+
+_GZIP = b"\x1f\x8b"
+
+_SURE = 0.5
+"""A file of another suffix is of a format that fits it so well at least."""
+
+
+def formats() -> tuple[Format, ...]:
+    """Return all formats: of this package, of others, and folders of tables.
+
+    Raises:
+        UsageError: If a format of another package can't be used.
+    """
+    taken = (*(form.name for form in FORMATS), WIDE)
+    return (*FORMATS, *added_formats(taken), table_folder(_is_table, open_table))
+
+
+def format_of(path: Path) -> tuple[Format, Reader]:
+    """Return the format of a log, by its suffix and its first bytes, and what reads it.
+
+    Among formats of its suffix the one that fits best is taken. A file that none of them fits is
+    of another format if that fits well; else the format of its suffix reports what is wrong.
+
+    Raises:
+        ImportFormatError: If there is no such file, or it is of none of the formats: the error
+            names what it looks like.
+        UsageError: If a format of another package can't be used.
+    """
+    if not path.is_dir() and not is_file(path):
+        raise ImportFormatError(path, why_no_file(path))
+    head = _head(path)
+    fits = [
+        (form, form.read, _fit(form, head, path)) for form in formats() if form.read is not None
+    ]
+    readable = [entry for entry in fits if entry[0].packed or not is_packed(path)]
+    named = [entry for entry in readable if format_suffix(path) in entry[0].suffixes]
+    least = 0.0 if path.is_dir() else _SURE
+    by_name, by_look = (
+        max(entries, key=lambda entry: entry[2], default=None) for entries in (named, readable)
+    )
+    if by_name is not None and by_name[2]:
+        return by_name[:2]
+    if by_look is not None and by_look[2] > least:
+        return by_look[:2]
+    if by_name is not None and not has_signature(head):
+        return by_name[:2]
+    raise ImportFormatError(path, _unknown(head, path, [form for form, *_ in fits]))
+
+
+def _fit(form: Format, head: bytes, path: Path) -> float:
+    """Return how well a file fits a format.
+
+    Raises:
+        DataError: If the format, which is of another package, fails.
+    """
+    try:
+        return float(form.sniff(head, path))
+    except UndulogError:
+        raise
+    except Exception as error:
+        raise DataError(
+            f"the format {form.name!r} failed at {path}: {type(error).__name__}: {error}; correct "
+            "or remove it"
+        ) from error
+
+
+def _unknown(head: bytes, path: Path, readable: list[Format]) -> str:
+    inside = "is compressed by gzip; inside it " if is_packed(path) and head[:2] != _GZIP else ""
+    valid = ", ".join(dict.fromkeys(suffix for form in readable for suffix in form.suffixes))
+    return (
+        f"is of no format that can be imported: it {inside}{looks_like(head, path)}; export it "
+        f"as one of {valid}"
+    )
+
+
+def _head(path: Path) -> bytes:
+    """Return the first bytes of a file, those behind ``.gz``; none if it can't be read."""
+    head = b""
+    try:
+        check_regular(path)
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+        if not is_packed(path):
+            return head
+        with gzip.open(path, "rb") as stream:
+            return stream.read(_HEAD)
+    except (OSError, EOFError, zlib.error):
+        return head
+
+
+def _is_table(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    return any(isinstance(form.read, TableReader) and suffix in form.suffixes for form in formats())
+
+
+def open_table(path: Path) -> TableFile:
+    """Open a file as a table.
+
+    Raises:
+        ImportFormatError: If it is none, or damaged.
+        MissingExtraError: If a package that reads it is not installed.
+    """
+    form, reader = format_of(path)
+    if not isinstance(reader, TableReader):
+        raise ImportFormatError(path, f"is no table: it {reader.holds} ({form.title})")
+    return reader.open(path)
+
+
+def format_for(output: Path, to: str | None = None) -> tuple[str, Writer]:
+    """Return how an output is named in messages, and what writes it.
+
+    Args:
+        to: Name of the format, where the suffix doesn't select it.
+
+    Raises:
+        UsageError: If there is none of this suffix or name, or a format of another package can't
+            be used.
+    """
+    suffix = output.suffix.lower()
+    writers = [(form, form.write) for form in formats() if form.write is not None]
+    by_suffix = {form.suffixes[0]: writer for form, writer in writers if writer.by_suffix}
+    by_name = {form.name: writer for form, writer in writers if not writer.by_suffix}
+    if to == WIDE:
+        tables = {key: w for key, w in by_suffix.items() if isinstance(w, TableWriter)}
+        if suffix not in tables:
+            valid = ", ".join(tables)
+            raise UsageError(f"{output}: no wide table has the suffix {suffix!r}; valid: {valid}")
+        return f"--to {to}", WideTableWriter(tables[suffix])
+    if to in by_name:
+        return f"--to {to}", by_name[to]
+    if to is None and suffix in by_suffix:
+        return f"a {suffix} file", by_suffix[suffix]
+    why = f"no format has the suffix {suffix!r}" if to is None else f"no format is named {to!r}"
+    valid = f"{', '.join(by_suffix)}, or --to {', '.join([WIDE, *by_name])}"
+    raise UsageError(f"{output}: {why}; valid: {valid}")
