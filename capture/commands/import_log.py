@@ -80,11 +80,11 @@ def import_log(
     """
     from ..common.process import interruptible
     from ..exchange.import_options import ImportOptions
-    from ..exchange.registry.registry import format_of, open_table
+    from ..exchange.registry.registry import format_of, guarded, open_table
 
     if map_ and log.is_dir():
         raise UsageError(f"{log} is a folder; --map is for one table")
-    _, reader = format_of(log)
+    form, reader = format_of(log)
     if output.suffix or not reader.several:
         why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
         check_output(output, (".mcap",), why, force=force)
@@ -99,7 +99,8 @@ def import_log(
             columns=columns, map=map_, units=unit, write_map=write_map, fps=fps, episode=episode,
             bus=bus, topics=topics.names, force=force, stop=stop,
         )  # fmt: skip
-        reports = reader.into_session(log, output, options)
+        with guarded(form, log):
+            reports = reader.into_session(log, output, options)
     code = _report_imports(reports, json=json)
     if len(reports) > 1 and not json:
         echo(f"what is wrong with which episode: undulog analyse {log}")

@@ -26,7 +26,7 @@ _FOR = {
 def log_export(
     *sessions: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    to: Target | None = None,
+    to: Target | str | None = None,
     bus: str | None = None,
     topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
     fps: int | None = None,
@@ -75,20 +75,20 @@ def log_export(
         json: Report as one JSON object.
     """
     from ..common.process import interruptible
-    from ..exchange.registry.registry import format_for
+    from ..exchange.registry.registry import format_for, guarded
 
     if not sessions:
         raise UsageError("log export needs a session, e.g. undulog log export run.mcap -o run.csv")
     options = {"bus": bus, "topics": topics, "fps": fps, "task": task, "frame": frame}
     given = {key: value for key, value in options.items() if value not in (None, ())}
-    name, writer = format_for(output, to)
+    name, form, writer = format_for(output, to)
     for option in given:
         if option not in writer.options:
             raise UsageError(f"--{option} is for {_FOR[option]}; {name} {writer.holds}")
     if len(sessions) > 1 and not writer.several:
         raise UsageError(f"{name} takes one session, not {len(sessions)}")
     read = sessions_of(sessions) if writer.several else list(sessions)
-    with interruptible() as stop:
+    with interruptible() as stop, guarded(form, output):
         written = writer.out_of_session(read, output, **given, force=force, stop=stop)
     source = [str(path) for path in read] if writer.several else str(read[0])
     facts = {"source": source, "output": str(output), **written.facts}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 HEAD = 4096
 """Bytes of a file that tell what it looks like."""
@@ -62,19 +61,16 @@ _RIFF = {b"WAVE": "WAVE audio", b"AVI ": "an AVI video", b"WEBP": "a WebP image"
 _PICKLE = re.compile(rb"\x80[\x02-\x05]")
 _TAR = slice(257, 262)
 _MOST_OF_LINE = 40
-_DELIMITERS = ",;\t "
+_DELIMITERS = ",;\t"
 _LEAST_LINES = 2
 
 
-def looks_like(head: bytes, path: Path) -> str:
+def looks_like(head: bytes) -> str:
     """Return what a file looks like, as in ``x.h5: it looks like HDF5``.
 
     Args:
         head: Its first bytes, :data:`HEAD` of them or more.
-        path: Its path; a file that is empty or a folder has no bytes.
     """
-    if path.is_dir():
-        return "is a folder"
     if not head.strip():
         return "is empty"
     begin = head[:8].hex(" ")

@@ -202,14 +202,14 @@ class _Noting(logging.Handler):
 def _noted(name: str, problems: list[str]) -> Generator[None]:
     """Note what a library only warns of, e.g. a line that it passes over."""
     logger, handler = logging.getLogger(name), _Noting(problems)
-    trc = logging.getLogger("can.io.trc")  # it passes over lines without a warning
-    level = trc.level
+    silent = logging.getLogger("can.io.trc")  # it passes over lines without a warning
+    level = silent.level
     logger.addHandler(handler)
-    trc.setLevel(logging.INFO)
+    silent.setLevel(logging.INFO)
     try:
         yield
     finally:
-        trc.setLevel(level)
+        silent.setLevel(level)
         logger.removeHandler(handler)
 
 

@@ -45,7 +45,7 @@ def open_mapped(source, column_map):
 
 def export_file(source, output, *, to=None, **options):
     """Export by the suffix of the output, or by name."""
-    return format_for(output, to)[1].out_of_session([source], output, **options)
+    return format_for(output, to)[2].out_of_session([source], output, **options)
 
 
 def export_wide(source, output, **options):

@@ -34,8 +34,8 @@ _DELIMITERS = (";", "\t", ",", " ")
 _TRACKS = "scorer"
 """First cell of a file of DeepLabCut."""
 
-_LEAST_NUMBERS = 0.5
-"""Part of the cells below the header of a text of another suffix that are numbers."""
+_LEAST_ROWS, _LEAST_NUMBERS = 2, 0.5
+"""Of a text of another suffix: rows, and part of the columns that are numbers (by spaces: all)."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,13 @@ def _sniff(head: bytes, path: Path) -> float:
     """Recognise lines that one delimiter cuts alike, with numbers below the first of them."""
     try:
         lines = head[: head.rfind(b"\n") + 1].decode("utf-8-sig").splitlines()
-        _, rows = _cut(path, _data_lines(lines)[:_FIRST_LINES])
+        delimiter, rows = _cut(path, _data_lines(lines)[:_FIRST_LINES])
     except (UnicodeDecodeError, ImportFormatError):
         return 0.0
-    cells = [cell for row in rows[1:] for cell in row if cell.strip()]
-    numbers = sum(map(_is_number, cells))
-    return 0.6 if numbers and numbers >= _LEAST_NUMBERS * len(cells) else 0.0
+    columns = zip(*rows[1:], strict=True)
+    numeric = [all(_is_number(cell) for cell in column if cell) for column in columns]
+    least = 1.0 if delimiter == " " else _LEAST_NUMBERS
+    return 0.6 if len(rows) > _LEAST_ROWS and sum(numeric) >= least * len(rows[0]) else 0.0
 
 
 @contextmanager

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...common.errors import DataError, ImportFormatError, UndulogError, UsageError
 from ...common.files import check_regular, is_file, why_no_file
 from ...common.looks import has_signature, looks_like
+from ...common.strict_table import listed
 from ..formats import (
     asc,
     can_csv,
@@ -69,8 +72,8 @@ _HEAD = 1 << 16
 
 _GZIP = b"\x1f\x8b"
 
-_SURE = 0.5
-"""A file of another suffix is of a format that fits it so well at least."""
+_SURE, _LEAST = 0.5, 0.01
+"""A file of another suffix is of a format that fits it so well at least, and a folder."""
 
 
 def formats() -> tuple[Format, ...]:
@@ -96,47 +99,62 @@ def format_of(path: Path) -> tuple[Format, Reader]:
     """
     if not path.is_dir() and not is_file(path):
         raise ImportFormatError(path, why_no_file(path))
-    head = _head(path)
+    head, packed = _head(path), is_packed(path)
     fits = [
         (form, form.read, _fit(form, head, path)) for form in formats() if form.read is not None
     ]
-    readable = [entry for entry in fits if entry[0].packed or not is_packed(path)]
-    named = [entry for entry in readable if format_suffix(path) in entry[0].suffixes]
-    least = 0.0 if path.is_dir() else _SURE
-    by_name, by_look = (
-        max(entries, key=lambda entry: entry[2], default=None) for entries in (named, readable)
-    )
+    named = [
+        entry
+        for entry in fits
+        if format_suffix(path) in entry[0].suffixes and (entry[0].packed or not packed)
+    ]
+    by_name = max(named, key=lambda entry: entry[2], default=None)
+    by_look = max(fits, key=lambda entry: entry[2])
     if by_name is not None and by_name[2]:
         return by_name[:2]
-    if by_look is not None and by_look[2] > least:
-        return by_look[:2]
-    if by_name is not None and not has_signature(head):
+    if by_look[2] >= (_SURE if head else _LEAST):
+        if by_look[0].packed or not packed:
+            return by_look[:2]
+    elif by_name is not None and not has_signature(head):
         return by_name[:2]
     raise ImportFormatError(path, _unknown(head, path, [form for form, *_ in fits]))
 
 
-def _fit(form: Format, head: bytes, path: Path) -> float:
-    """Return how well a file fits a format.
+@contextmanager
+def guarded(form: Format, path: Path) -> Generator[None]:
+    """Turn a failure of a format of another package into an error that names both.
+
+    Args:
+        path: What it reads or writes.
 
     Raises:
-        DataError: If the format, which is of another package, fails.
+        DataError: If it raises what is no error of this tree.
     """
     try:
-        return float(form.sniff(head, path))
-    except UndulogError:
+        yield
+    except (UndulogError, OSError, MemoryError):
         raise
     except Exception as error:
+        if form in FORMATS:
+            raise
         raise DataError(
-            f"the format {form.name!r} failed at {path}: {type(error).__name__}: {error}; correct "
-            "or remove it"
+            f"{path}: the format {form.name!r} failed: {type(error).__name__}: {error}; correct or "
+            "remove it"
         ) from error
 
 
+def _fit(form: Format, head: bytes, path: Path) -> float:
+    with guarded(form, path):
+        return float(form.sniff(head, path))
+
+
 def _unknown(head: bytes, path: Path, readable: list[Format]) -> str:
-    inside = "is compressed by gzip; inside it " if is_packed(path) and head[:2] != _GZIP else ""
     valid = ", ".join(dict.fromkeys(suffix for form in readable for suffix in form.suffixes))
+    inside, unpack = "", ""
+    if is_packed(path) and not head.startswith(_GZIP):
+        inside, unpack = "is compressed by gzip; inside it ", "unpack it or "
     return (
-        f"is of no format that can be imported: it {inside}{looks_like(head, path)}; export it "
+        f"is of no format that can be imported: it {inside}{looks_like(head)}; {unpack}export it "
         f"as one of {valid}"
     )
 
@@ -171,11 +189,12 @@ def open_table(path: Path) -> TableFile:
     form, reader = format_of(path)
     if not isinstance(reader, TableReader):
         raise ImportFormatError(path, f"is no table: it {reader.holds} ({form.title})")
-    return reader.open(path)
+    with guarded(form, path):
+        return reader.open(path)
 
 
-def format_for(output: Path, to: str | None = None) -> tuple[str, Writer]:
-    """Return how an output is named in messages, and what writes it.
+def format_for(output: Path, to: str | None = None) -> tuple[str, Format, Writer]:
+    """Return how an output is named in messages, its format, and what writes it.
 
     Args:
         to: Name of the format, where the suffix doesn't select it.
@@ -186,18 +205,23 @@ def format_for(output: Path, to: str | None = None) -> tuple[str, Writer]:
     """
     suffix = output.suffix.lower()
     writers = [(form, form.write) for form in formats() if form.write is not None]
-    by_suffix = {form.suffixes[0]: writer for form, writer in writers if writer.by_suffix}
-    by_name = {form.name: writer for form, writer in writers if not writer.by_suffix}
+    by_suffix = {form.suffixes[0]: (form, writer) for form, writer in writers if writer.by_suffix}
+    by_name = {form.name: (form, writer) for form, writer in writers if not writer.by_suffix}
     if to == WIDE:
-        tables = {key: w for key, w in by_suffix.items() if isinstance(w, TableWriter)}
+        tables = {
+            key: (form, w) for key, (form, w) in by_suffix.items() if isinstance(w, TableWriter)
+        }
         if suffix not in tables:
             valid = ", ".join(tables)
             raise UsageError(f"{output}: no wide table has the suffix {suffix!r}; valid: {valid}")
-        return f"--to {to}", WideTableWriter(tables[suffix])
+        form, writer = tables[suffix]
+        return f"--to {to}", form, WideTableWriter(writer)
     if to in by_name:
-        return f"--to {to}", by_name[to]
+        return f"--to {to}", *by_name[to]
     if to is None and suffix in by_suffix:
-        return f"a {suffix} file", by_suffix[suffix]
-    why = f"no format has the suffix {suffix!r}" if to is None else f"no format is named {to!r}"
+        return f"a {suffix} file", *by_suffix[suffix]
+    if to is not None:
+        valid = listed([WIDE, *by_name], to)
+        raise UsageError(f"--to {to}: no format has this name; valid: {valid}")
     valid = f"{', '.join(by_suffix)}, or --to {', '.join([WIDE, *by_name])}"
-    raise UsageError(f"{output}: {why}; valid: {valid}")
+    raise UsageError(f"{output}: no format has the suffix {suffix!r}; valid: {valid}")

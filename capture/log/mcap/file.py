@@ -33,6 +33,7 @@ from mcap.records import (
 
 from ...common.arrays import IntArray, frozen
 from ...common.errors import LogError, NotALogError
+from ...common.looks import HEAD, looks_like
 from .chunk import (
     MAGIC,
     PREFIX_SIZE,
@@ -337,11 +338,10 @@ class McapFile(Contents, McapPayloads):
 
     def _find_contents(self, *, bare: bool) -> None:
         if self.buffer[: len(MAGIC)] != MAGIC:
-            start = bytes(self.buffer[: len(MAGIC)]).hex(" ")
+            looks = looks_like(bytes(self.buffer[:HEAD]))
             raise NotALogError(
                 self.path,
-                f"not an MCAP file (it starts with {start}); "
-                "'undulog import' reads CAN logs and CSV files",
+                f"not an MCAP file: it {looks}; 'undulog import' takes logs of other formats",
             )
         try:
             _Summary(self).read()
