@@ -1,15 +1,15 @@
 """PyTorch's ``.pt``: tensors, read without running what the file's pickle names.
 
 The file is a zip: ``*/data.pkl`` names tensors by storage, shape and stride, ``*/data/KEY`` holds
-the raw numbers. The pickle's opcodes are followed by a small machine of its own, which knows
-dictionaries, lists, numbers, texts and the rebuilding of tensors; what a pickle would call besides
-is not run: its result is an object without a value.
+the raw numbers. The unpickler finds nothing but dictionaries and the rebuilding of tensors; what a
+pickle would call besides is not run: its result is an object without a value.
 """
 
 from __future__ import annotations
 
+import io
 import math
-import pickletools
+import pickle
 import sys
 import zipfile
 from collections.abc import Mapping
@@ -32,20 +32,9 @@ _DTYPES = {
     "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
     "BoolStorage": "?",
 }  # fmt: skip
-_TENSOR = ("torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor")
+_TENSORS = {"torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor"}
 _PARAMETER = "torch._utils _rebuild_parameter"
 _ORDERED = "collections OrderedDict"
-_MARK = object()
-_NOT_RUN = object()
-_PUSHED = {
-    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4",
-    "FLOAT", "BINFLOAT", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "STRING",
-    "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
-}  # fmt: skip
-_CONSTANT = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_PUT = {"PUT", "BINPUT", "LONG_BINPUT"}
-_GET = {"GET", "BINGET", "LONG_BINGET"}
 
 _ENTRY_NAME = slice(30, 4096)
 """Where the name of a zip's first entry is."""
@@ -57,7 +46,12 @@ def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats h
 
 @dataclass(frozen=True)
 class _Global:
+    """What a pickle names, which is not imported."""
+
     name: str
+
+    def __call__(self, *_: object) -> _NotRun:
+        return _NotRun()
 
 
 @dataclass(frozen=True)
@@ -82,17 +76,20 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ImportFormatError: If it is no such zip, or its pickle does more than name tensors.
     """
-    faults = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
+    faults = (
+        OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, OverflowError,
+        pickle.UnpicklingError,
+    )  # fmt: skip
     with (
         raised_as(ImportFormatError, path, "is no zip by torch.save", *UNZIPPING),
         raised_as(ImportFormatError, path, "is no file of tensors by torch.save", *faults),
         zipfile.ZipFile(path) as archive,
     ):
-        (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
-        root = pickle.removesuffix("data.pkl")
-        if archive.getinfo(pickle).file_size > _MOST_PICKLE:
+        (entry,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
+        root = entry.removesuffix("data.pkl")
+        if archive.getinfo(entry).file_size > _MOST_PICKLE:
             refuse(path, "its data.pkl is too large to name tensors only")
-        value = _Machine(path).run(bytes(read_entry(archive, archive.getinfo(pickle))))
+        value = _Tensors(io.BytesIO(read_entry(archive, archive.getinfo(entry)))).load()
         storages = _Storages(path, archive, root)
         return {
             name: storages.array(tensor) if tensor is not None else np.array(None)
@@ -107,99 +104,42 @@ def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
         return ">" if stream.read(4) == b"big" else "<"
 
 
-class _Machine:
-    """The opcodes of a pickle that names tensors."""
+class _NotRun:
+    """Stands for what a pickle calls: it has no value."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stack: list[Any] = []
-        self._memo: dict[int, Any] = {}
+    def __setstate__(self, _: object) -> None:
+        """Drop the state."""
 
-    def run(self, data: bytes) -> object:
-        for opcode, argument, _ in pickletools.genops(data):
-            if opcode.name == "STOP":
-                break
-            self._step(opcode.name, argument)
-        return self._stack.pop()
 
-    def _step(self, name: str, argument: Any) -> None:  # noqa: C901, PLR0912 - a table of opcodes
-        stack = self._stack
-        if name in {"PROTO", "FRAME"}:
-            return
-        if name in _PUSHED:
-            stack.append(_CONSTANT.get(name, argument))
-        elif name == "MARK":
-            stack.append(_MARK)
-        elif name in {"EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE"}:
-            stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[name]())
-        elif name in _PUT:
-            self._memo[int(argument)] = stack[-1]
-        elif name == "MEMOIZE":
-            self._memo[len(self._memo)] = stack[-1]
-        elif name in _GET:
-            stack.append(self._memo[int(argument)])
-        elif name == "GLOBAL":
-            stack.append(_Global(str(argument)))
-        elif name == "STACK_GLOBAL":
-            member, module = stack.pop(), stack.pop()
-            if not isinstance(module, str) or not isinstance(member, str):
-                raise ImportFormatError(self._path, "its pickle names something else than tensors")
-            stack.append(_Global(f"{module} {member}"))
-        elif name == "TUPLE":
-            stack.append(tuple(self._marked()))
-        elif name in _TUPLES:
-            count = _TUPLES[name]
-            items = tuple(stack[-count:])
-            del stack[-count:]
-            stack.append(items)
-        elif name in {"APPEND", "APPENDS"}:
-            items = [stack.pop()] if name == "APPEND" else self._marked()
-            cast("list[Any]", stack[-1]).extend(items)
-        elif name in {"SETITEM", "SETITEMS"}:
-            items = [stack.pop(-2), stack.pop()] if name == "SETITEM" else self._marked()
-            if not all(isinstance(key, str | int) for key in items[::2]):
-                raise ImportFormatError(self._path, "its pickle has a key that is no name")
-            cast("dict[Any, Any]", stack[-1]).update(zip(items[::2], items[1::2], strict=True))
-        elif name == "BINPERSID":
-            stack.append(self._storage(stack.pop()))
-        elif name == "REDUCE":
-            arguments = stack.pop()
-            stack.append(self._rebuilt(stack.pop(), arguments))
-        elif name == "BUILD":  # the state of a dictionary of weights: metadata only
-            stack.pop()
-        else:
-            raise ImportFormatError(self._path, f"its pickle has {name}, which names no tensor")
+class _Dictionary(dict[Any, Any], _NotRun):
+    """Stands for an OrderedDict, whose state is metadata."""
 
-    def _marked(self) -> list[Any]:
-        at = len(self._stack) - 1
-        while at >= 0 and self._stack[at] is not _MARK:
-            at -= 1
-        if at < 0:
-            raise ValueError("its pickle takes more than it gave")
-        items = self._stack[at + 1 :]
-        del self._stack[at:]
-        return items
 
-    def _storage(self, words: Any) -> _Storage:
-        kind, storage, key = words[0], words[1], words[2]
-        plain = kind == "storage" and isinstance(storage, _Global) and isinstance(key, str)
-        if not plain:
-            raise ImportFormatError(self._path, "its pickle names something else than storages")
-        dtype = _DTYPES.get(storage.name.removeprefix("torch "), "")
-        return _Storage(dtype, key)
+class _Tensors(pickle.Unpickler):
+    """Reads a pickle that names tensors; of what it names nothing else is imported or called."""
 
-    def _rebuilt(self, function: Any, arguments: Any) -> object:
-        name = function.name if isinstance(function, _Global) else ""
-        if name == _ORDERED:
-            return {}
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        name = f"{module_name} {global_name}"
+        if name in _TENSORS:
+            return _tensor
         if name == _PARAMETER:
-            return arguments[0]
-        if name not in _TENSOR or not isinstance(arguments[0], _Storage):
-            return _NOT_RUN
-        shape, stride = (tuple(map(int, numbers[:_DEEPEST])) for numbers in arguments[2:4])
-        if max((*shape, *stride, int(arguments[1])), default=0) > MOST_BYTES:
-            raise ValueError(f"a tensor of more than {MOST_BYTES} numbers")
-        return _Tensor(arguments[0], int(arguments[1]), shape, stride)
+            return lambda tensor, *_: tensor  # pyright: ignore[reportUnknownLambdaType, reportUnknownVariableType]
+        return _Dictionary if name == _ORDERED else _Global(name)
+
+    def persistent_load(self, pid: Any, /) -> _Storage:
+        kind, storage, key = pid[:3]
+        if kind != "storage" or not isinstance(storage, _Global) or not isinstance(key, str):
+            raise ValueError("its pickle names something else than storages")
+        return _Storage(_DTYPES.get(storage.name.removeprefix("torch "), ""), key)
+
+
+def _tensor(storage: Any, offset: Any, *layout: Any) -> object:
+    if not isinstance(storage, _Storage):
+        return _NotRun()
+    shape, stride = (tuple(map(int, numbers[:_DEEPEST])) for numbers in layout[:2])
+    if max((*shape, *stride, int(offset)), default=0) > MOST_BYTES:
+        raise ValueError(f"a tensor of more than {MOST_BYTES} numbers")
+    return _Tensor(storage, int(offset), shape, stride)
 
 
 def _named(value: object) -> dict[str, _Tensor | None]:
@@ -220,6 +160,8 @@ def _named(value: object) -> dict[str, _Tensor | None]:
             tensors[name or "tensor"] = item if item.storage.dtype else None
         elif isinstance(item, Mapping):
             inner = list(cast("Mapping[object, object]", item).items())
+            if not all(isinstance(key, str | int) for key, _ in inner):
+                raise ValueError("a dictionary has a key that is no name")
             waiting += [
                 (f"{name}.{key}" if name else str(key), nested, depth + 1)
                 for key, nested in inner[::-1]
