@@ -20,7 +20,7 @@ COMMON = {"csv", "parquet", "mat", "pt"}
 @pytest.fixture(scope="module")
 def folders():
     """Word of an identifier, or of a module's name, to the folders that it stands in."""
-    found = defaultdict(set)
+    places = defaultdict(set)
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):
             if path.parts[len(ROOT.parts)] == "undulog" and len(path.parts) > len(ROOT.parts) + 2:
@@ -30,9 +30,9 @@ def folders():
             for name in {*names, path.stem, path.parent.name}:
                 apart = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
                 for word in {*apart.split("_"), apart}:
-                    found[word].add(path.parent.relative_to(ROOT))
-    assert len(found) > 1000
-    return found
+                    places[word].add(path.parent.relative_to(ROOT))
+    assert len(places) > 1000
+    return places
 
 
 def test_each_format_is_a_file_or_a_folder_of_its_own():

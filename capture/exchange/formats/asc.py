@@ -90,11 +90,6 @@ def _notes(facts: FrameFacts) -> Iterator[str]:
 
 
 FORMAT = Format(
-    "asc",
-    "Vector ASC",
-    (".asc",),
-    _sniff,
-    FrameReader(_read),
-    FrameWriter("Vector ASC", _kept, _notes, _write),
-    packed=True,
-)
+    "asc", "Vector ASC", (".asc",), _sniff, FrameReader(_read),
+    FrameWriter("Vector ASC", _kept, _notes, _write), packed=True,
+)  # fmt: skip

@@ -30,5 +30,5 @@ def _read(path: Path) -> Generator[FrameLog]:
 
 
 FORMAT = Format(
-    "can_csv", "CAN frames by python-can", (".csv",), _sniff, FrameReader(_read), packed=True
-)
+    "can_csv", "CAN frames by python-can", (".csv",), _sniff, FrameReader(_read), packed=True,
+)  # fmt: skip

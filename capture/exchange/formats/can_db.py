@@ -49,9 +49,6 @@ def _check(path: Path) -> None:
 
 
 FORMAT = Format(
-    "can_db",
-    "CAN frames by python-can, in SQLite",
-    (".db",),
-    _sniff,
+    "can_db", "CAN frames by python-can, in SQLite", (".db",), _sniff,
     FrameReader(confined(f"{__name__}:open_database_log")),
-)
+)  # fmt: skip

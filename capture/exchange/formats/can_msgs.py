@@ -130,15 +130,9 @@ def _namespace(bus: str) -> str:
 
 
 FORMAT = Format(
-    "can_msgs",
-    "CAN frames of ROS 2",
-    (".mcap",),
-    not_read,
+    "can_msgs", "CAN frames of ROS 2", (".mcap",), not_read,
     write=FrameWriter(
-        f"{TYPE_NAME}, one message a frame",
-        lambda block: block.frames,
-        _ros_notes,
-        _open_ros,
+        f"{TYPE_NAME}, one message a frame", lambda block: block.frames, _ros_notes, _open_ros,
         holds_fd=False,
     ),
-)
+)  # fmt: skip

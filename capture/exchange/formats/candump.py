@@ -188,11 +188,6 @@ def _write(path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
 
 
 FORMAT = Format(
-    "candump",
-    "candump trace",
-    (".log",),
-    _sniff,
-    FrameReader(_read),
-    FrameWriter("candump -L", _kept, lambda _: (), _write),
-    packed=True,
-)
+    "candump", "candump trace", (".log",), _sniff, FrameReader(_read),
+    FrameWriter("candump -L", _kept, lambda _: (), _write), packed=True,
+)  # fmt: skip

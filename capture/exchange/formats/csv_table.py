@@ -297,10 +297,6 @@ def _write(path: Path, columns: Mapping[str, str]) -> Generator[WriteCells]:
 
 
 FORMAT = Format(
-    "csv",
-    "CSV and other delimited text",
-    (".csv", ".tsv", ".txt"),
-    _sniff,
-    TableReader(_read),
-    TableWriter(_write),
-)
+    "csv", "CSV and other delimited text", (".csv", ".tsv", ".txt"), _sniff,
+    TableReader(_read), TableWriter(_write),
+)  # fmt: skip

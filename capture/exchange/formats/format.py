@@ -9,7 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from ..frame_export import FrameWriter
+from ..frame_reader import FrameReader
+from ..table_format import TableReader, TableWriter, WideTableWriter
 
 if TYPE_CHECKING:
     from ..import_options import ImportOptions
@@ -20,95 +24,6 @@ Sniff: TypeAlias = Callable[[bytes, Path], float]
 
 The bytes are those behind the compression where a file is compressed; a folder has none.
 """
-
-
-class Reader(Protocol):
-    """Reads a log into a session."""
-
-    @property
-    def holds(self) -> str:
-        """What such a log is, as in ``trace.log holds CAN frames``."""
-        ...
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Options of ``undulog import`` that it takes, besides those of all."""
-        ...
-
-    @property
-    def several(self) -> bool:
-        """Whether a log gives several sessions, which go into a folder."""
-        ...
-
-    def into_session(
-        self, source: Path, output: Path, options: ImportOptions
-    ) -> list[ImportReport]:
-        """Write the session, or the sessions, of a log.
-
-        Raises:
-            LogError: If the log can't be read, or a session can't be written.
-            UsageError: If an option is missing.
-        """
-        ...
-
-
-class Writer(Protocol):
-    """Writes a session, or several, in a format."""
-
-    @property
-    def holds(self) -> str:
-        """What such an output has, as in ``a .log file has CAN frames``."""
-        ...
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Options of ``undulog log export`` that it takes."""
-        ...
-
-    @property
-    def several(self) -> bool:
-        """Whether it takes several sessions."""
-        ...
-
-    @property
-    def by_suffix(self) -> bool:
-        """Whether the suffix of the output chooses it; else ``--to`` does."""
-        ...
-
-    def out_of_session(self, sources: Sequence[Path], output: Path, **options: Any) -> ExportReport:
-        """Write a file or a folder.
-
-        Args:
-            options: Those of :attr:`options` that were given, ``force`` and ``stop``.
-
-        Raises:
-            UndulogError: If a session can't be read or the output can't be written; nothing is
-                left behind then.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class Format:
-    """A format.
-
-    Attributes:
-        name: Small letters, digits, - and _.
-        title: What a file of it is called, as in ``x.blf is no Vector BLF``.
-        suffixes: In small letters, with their dot; the first one is written.
-        sniff: Returns how well a file fits.
-        read: Reads it; None if it is only written.
-        write: Writes it; None if it is only read.
-        packed: Whether it is also read with ``.gz`` behind the suffix.
-    """
-
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    sniff: Sniff
-    read: Reader | None = None
-    write: Writer | None = None
-    packed: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,6 +70,46 @@ class DirectWriter:
     def out_of_session(self, sources: Sequence[Path], output: Path, **options: Any) -> ExportReport:
         """Write a file or a folder."""
         return self.export(sources if self.several else sources[0], output, **options)
+
+
+Reader: TypeAlias = FrameReader | TableReader | DirectReader
+"""Reads a log into a session.
+
+``holds`` is what such a log is, as in ``trace.log holds CAN frames``, ``options`` are those of
+``undulog import`` that it takes besides those of all, ``several`` is whether a log gives several
+sessions, which go into a folder. ``into_session`` writes them.
+"""
+
+Writer: TypeAlias = FrameWriter | TableWriter | WideTableWriter | DirectWriter
+"""Writes a session in a format.
+
+``holds`` is what such an output has, ``options`` are those of ``undulog log export`` that it takes,
+``several`` is whether it takes several sessions, and ``by_suffix`` whether the suffix of the output
+chooses it; else ``--to`` does. ``out_of_session`` writes the output.
+"""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Attributes:
+        name: Small letters, digits, - and _.
+        title: What a file of it is called, as in ``x.blf is no Vector BLF``.
+        suffixes: In small letters, with their dot; the first one is written.
+        sniff: Returns how well a file fits.
+        read: Reads it; None if it is only written.
+        write: Writes it; None if it is only read.
+        packed: Whether it is also read with ``.gz`` behind the suffix.
+    """
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    sniff: Sniff
+    read: Reader | None = None
+    write: Writer | None = None
+    packed: bool = False
 
 
 def not_read(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it

@@ -123,9 +123,6 @@ def _stacked(names: Sequence[str]) -> Any:
 
 
 FORMAT = Format(
-    "foxglove-layout",
-    "layout of Foxglove",
-    (".json",),
-    not_read,
+    "foxglove-layout", "layout of Foxglove", (".json",), not_read,
     write=DirectWriter(export_foxglove_layout, "has plots", ("topics",)),
-)
+)  # fmt: skip

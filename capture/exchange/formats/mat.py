@@ -77,9 +77,6 @@ def _check_mat(path: Path) -> None:
 
 
 FORMAT = Format(
-    "mat",
-    "MATLAB arrays (.mat)",
-    (".mat",),
-    _sniff,
+    "mat", "MATLAB arrays (.mat)", (".mat",), _sniff,
     TableReader(confined_arrays(f"{__name__}:read_mat", "mat")),
-)
+)  # fmt: skip

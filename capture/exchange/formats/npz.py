@@ -69,9 +69,6 @@ def _npy(data: bytearray, name: str) -> NDArray[Any] | None:
 
 
 FORMAT = Format(
-    "npz",
-    "NumPy arrays (.npz)",
-    (".npz",),
-    _sniff,
+    "npz", "NumPy arrays (.npz)", (".npz",), _sniff,
     TableReader(confined_arrays(f"{__name__}:read_npz", "npz")),
-)
+)  # fmt: skip

@@ -71,5 +71,5 @@ def _write(path: Path, columns: Mapping[str, str]) -> Generator[WriteCells]:
 
 
 FORMAT = Format(
-    "parquet", "Parquet", (".parquet",), _sniff, TableReader(_read), TableWriter(_write)
-)
+    "parquet", "Parquet", (".parquet",), _sniff, TableReader(_read), TableWriter(_write),
+)  # fmt: skip

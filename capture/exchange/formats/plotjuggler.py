@@ -88,9 +88,6 @@ def _plot_element(plot: JointPlot, duration_s: float) -> ET.Element:
 
 
 FORMAT = Format(
-    "plotjuggler-layout",
-    "layout of PlotJuggler",
-    (".xml",),
-    not_read,
+    "plotjuggler-layout", "layout of PlotJuggler", (".xml",), not_read,
     write=DirectWriter(export_plotjuggler_layout, "has plots", ("topics",)),
-)
+)  # fmt: skip

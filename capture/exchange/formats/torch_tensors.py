@@ -208,9 +208,6 @@ class _Storages:
 
 
 FORMAT = Format(
-    "pt",
-    "PyTorch tensors (.pt)",
-    (".pt", ".pth"),
-    _sniff,
+    "pt", "PyTorch tensors (.pt)", (".pt", ".pth"), _sniff,
     TableReader(confined_arrays(f"{__name__}:read_tensors", "pt")),
-)
+)  # fmt: skip

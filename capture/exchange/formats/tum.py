@@ -217,9 +217,6 @@ def _of_transforms(
 
 
 FORMAT = Format(
-    "tum",
-    "TUM trajectory",
-    SUFFIXES,
-    not_read,
+    "tum", "TUM trajectory", SUFFIXES, not_read,
     write=DirectWriter(export_tum, "has poses", ("frame",)),
-)
+)  # fmt: skip

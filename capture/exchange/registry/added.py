@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from ...common.errors import UsageError
-from ..formats.format import Format
+from ..formats.format import Format, Reader, Writer
 
 ENTRY_POINTS = "undulog.formats"
 """Group of the entry points."""
@@ -60,26 +60,20 @@ def _fault(fields: dict[str, Any]) -> str:
     """Return which field is wrong and what it has to be; empty if none is."""
     title, suffixes, read, write = (fields[n] for n in ("title", "suffixes", "read", "write"))
     are_suffixes = isinstance(suffixes, tuple) and all(map(_is_suffix, cast("Any", suffixes)))
-    faults = {
-        "its 'title' has to be a text": not (isinstance(title, str) and title),
-        "its 'suffixes' have to be a tuple of texts such as '.abc', in small letters": (
-            not are_suffixes
-        ),
-        "its 'sniff' has to be a function of bytes and path": not callable(fields["sniff"]),
-        "its 'read' has to be a reader": not _is_part(read, "into_session"),
-        "its 'write' has to be a writer": not _is_part(write, "out_of_session"),
-        "it needs 'read' or 'write'": read is write is None,
-        "its 'write' needs a suffix": write is not None and not suffixes,
+    checks: dict[str, bool] = {
+        "its 'title' has to be a text": bool(isinstance(title, str) and title),
+        "its 'suffixes' have to be a tuple of texts such as '.abc', in small letters": are_suffixes,
+        "its 'sniff' has to be a function of bytes and path": callable(fields["sniff"]),
+        "its 'read' has to be a reader": isinstance(read, Reader | None),
+        "its 'write' has to be a writer": isinstance(write, Writer | None),
+        "it needs 'read' or 'write'": not (read is write is None),
+        "its 'write' needs a suffix": write is None or bool(suffixes),
     }
-    return next((text for text, is_wrong in faults.items() if is_wrong), "")
+    return next((why for why, is_right in checks.items() if not is_right), "")
 
 
 def _is_suffix(suffix: object) -> bool:
     return isinstance(suffix, str) and _SUFFIX.fullmatch(suffix) is not None
-
-
-def _is_part(part: object, method: str) -> bool:
-    return part is None or callable(getattr(part, method, None))
 
 
 def _whose(point: EntryPoint) -> str:

@@ -6,6 +6,7 @@ import gzip
 import zlib
 from collections.abc import Generator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,27 +14,7 @@ from ...common.errors import DataError, ImportFormatError, UndulogError, UsageEr
 from ...common.files import check_regular, is_file, why_no_file
 from ...common.looks import has_signature, looks_like
 from ...common.strict_table import listed
-from ..formats import (
-    asc,
-    can_csv,
-    can_db,
-    can_msgs,
-    candump,
-    csv_table,
-    foxglove,
-    mat,
-    mf4,
-    npz,
-    parquet,
-    plotjuggler,
-    torch_tensors,
-    trc,
-    tum,
-)
-from ..formats.blf import format as blf
 from ..formats.format import Format, Reader, Writer
-from ..formats.lerobot import format as lerobot
-from ..formats.rosbag import format as rosbag
 from ..packed import format_suffix, is_packed
 from ..table_format import TableReader, TableWriter, WideTableWriter
 from .added import added_formats
@@ -42,27 +23,17 @@ from .table_folder import table_folder
 if TYPE_CHECKING:
     from ..table_file import TableFile
 
-FORMATS: tuple[Format, ...] = (
-    candump.FORMAT,
-    blf.FORMAT,
-    asc.FORMAT,
-    can_msgs.FORMAT,
-    trc.FORMAT,
-    can_db.FORMAT,
-    mf4.FORMAT,
-    csv_table.FORMAT,
-    can_csv.FORMAT,
-    parquet.FORMAT,
-    npz.FORMAT,
-    mat.FORMAT,
-    torch_tensors.FORMAT,
-    rosbag.FORMAT,
-    lerobot.FORMAT,
-    tum.FORMAT,
-    foxglove.FORMAT,
-    plotjuggler.FORMAT,
+_MODULES = (
+    "candump", "blf.format", "asc", "can_msgs", "trc", "can_db", "mf4", "csv_table", "can_csv",
+    "parquet", "npz", "mat", "torch_tensors", "rosbag.format", "lerobot.format", "tum", "foxglove",
+    "plotjuggler",
+)  # fmt: skip
+"""The table: modules of formats; of those that fit a file alike, the first is taken."""
+
+FORMATS: tuple[Format, ...] = tuple(
+    import_module(f"undulog.capture.exchange.formats.{name}").FORMAT for name in _MODULES
 )
-"""The formats of this package; of those that fit a file alike, the first is taken."""
+"""The formats of this package."""
 
 WIDE = "wide"
 """What ``--to`` names for a table with a column for each joint and quantity."""

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = Path("meta", "info.json")
 """The file by which a folder is a dataset."""
 
+_WHAT = "is a LeRobot dataset, which names its columns itself"
+
 
 def is_lerobot(folder: Path) -> bool:
     """Return whether a folder is a LeRobot dataset."""
@@ -48,15 +50,7 @@ def _write(
 
 
 FORMAT = Format(
-    "lerobot",
-    "LeRobot dataset",
-    (),
-    _sniff,
-    DirectReader(
-        _read,
-        "is a LeRobot dataset, which names its columns itself",
-        ("--unit", "--episode"),
-        several=True,
-    ),
+    "lerobot", "LeRobot dataset", (), _sniff,
+    DirectReader(_read, _WHAT, ("--unit", "--episode"), several=True),
     DirectWriter(_write, "has episodes", ("fps", "task"), several=True),
-)
+)  # fmt: skip

@@ -41,10 +41,7 @@ def _write(source: Path, output: Path, **options: Any) -> ExportReport:
 
 
 FORMAT = Format(
-    "rosbag2",
-    "bag of ROS",
-    (".mcap", ".db3", ".bag"),
-    _sniff,
+    "rosbag2", "bag of ROS", (".mcap", ".db3", ".bag"), _sniff,
     DirectReader(_read, "is a bag of ROS", ("--command-topic", "--response-topic")),
     DirectWriter(_write, "has all messages"),
-)
+)  # fmt: skip
