@@ -67,7 +67,7 @@ def _fault(fields: dict[str, Any]) -> str:
         "its 'read' has to be a reader": isinstance(read, Reader | None),
         "its 'write' has to be a writer": isinstance(write, Writer | None),
         "it needs 'read' or 'write'": not (read is write is None),
-        "its 'write' needs a suffix": write is None or bool(suffixes),
+        "its 'write' needs a suffix": write is None or suffixes != (),
     }
     return next((why for why, is_right in checks.items() if not is_right), "")
 

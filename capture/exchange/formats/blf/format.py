@@ -60,6 +60,7 @@ def _write(path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
 
 
 FORMAT = Format(
-    "blf", "Vector BLF", (".blf",), _sniff, FrameReader(confined(f"{__package__}.reading:open_blf")),
+    "blf", "Vector BLF", (".blf",), _sniff,
+    FrameReader(confined(f"{__package__}.reading:open_blf")),
     FrameWriter("Vector BLF", _kept, _notes, _write), packed=True,
 )  # fmt: skip
