@@ -10,8 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...common.errors import DataError, ImportFormatError, UndulogError, UsageError
-from ...common.files import check_regular, is_file, why_no_file
+from ...common.errors import DataError, ImportFormatError, UndulogError, UsageError, raised_as
+from ...common.files import is_file, why_no_file
 from ...common.looks import has_signature, looks_like
 from ...common.strict_table import listed
 from ..formats.format import Format, Reader, Writer
@@ -131,14 +131,21 @@ def _unknown(head: bytes, path: Path, readable: list[Format]) -> str:
 
 
 def _head(path: Path) -> bytes:
-    """Return the first bytes of a file, those behind ``.gz``; none if it can't be read."""
-    head = b""
+    """Return the first bytes of a file, those behind ``.gz`` where it is what its name says.
+
+    Raises:
+        ImportFormatError: If it can't be read.
+    """
+    if path.is_dir():
+        return b""
+    with (
+        raised_as(ImportFormatError, path, "can't be read", OSError),
+        path.open("rb") as stream,
+    ):
+        head = stream.read(_HEAD)
+    if not is_packed(path):
+        return head
     try:
-        check_regular(path)
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD)
-        if not is_packed(path):
-            return head
         with gzip.open(path, "rb") as stream:
             return stream.read(_HEAD)
     except (OSError, EOFError, zlib.error):

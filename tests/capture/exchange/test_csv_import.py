@@ -156,6 +156,44 @@ def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path):
     assert not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.parametrize("line", [3, 60, 17_000])
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ("{t},x", "column 'a': 'x' is not a number"),
+        ("{t},1e300", "column 'a': '1e+300' is not a finite number, or beyond 1e+200"),
+        ("now,1", "column 't': 'now' is not a time"),
+        ("-1,1", "column 't': time goes back, from"),
+        ("{t},1,2", "has 3 cells, the header 2"),
+    ],
+)
+def test_a_fault_names_its_row_wherever_it_is(line, cells, message, tmp_path):
+    rows = [f"{k},{k % 7}" for k in range(1, 17_100)]
+    rows[line - 2] = cells.format(t=line - 1)
+    text = "t,a\n" + "\n".join(rows) + "\n"
+    with pytest.raises(ImportFormatError, match=rf"row {line}[ ,].*{re.escape(message)}"):
+        run(tmp_path, text, "a=joint01.position:rad")
+
+
+def test_columns_that_a_map_names_are_taken_as_they_are(tmp_path, opened):
+    """Not as those of a long table, nor as tracks; a column without a name doesn't matter."""
+    text = "".join(f"{k},{k / 10},1,{k},{k + 1}\n" for k in range(6))
+    given = ("a_x=joint01.position:rad", "id=joint02.position:rad")
+    run(tmp_path, f",t,id,a_x,a_y\n{text}", *given)
+    states = opened(tmp_path / "run.mcap").joints("/joint_states")
+    np.testing.assert_array_equal(states.values, [[1.0] * 6, np.arange(6.0)][::-1])
+
+
+def test_numbers_are_read_to_the_last_bit(tmp_path, opened):
+    rng = np.random.default_rng(2)
+    numbers = rng.integers(0, 2**63, 5000, dtype=np.int64).view(np.float64)
+    numbers = numbers[np.abs(numbers) < 1e200]  # all other bits: exponents from -323 on
+    text = "".join(f"{k},{value!r}\n" for k, value in enumerate(numbers.tolist()))
+    run(tmp_path, f"t,a\n{text}", "a=joint01.position:rad")
+    values = opened(tmp_path / "run.mcap").joints("/joint_states").values[0]
+    np.testing.assert_array_equal(values, numbers)
+
+
 def test_all_faults_of_a_map_are_listed(tmp_path):
     (tmp_path / "map.toml").write_text(MAP)
     with pytest.raises(FaultyFileError) as caught:
