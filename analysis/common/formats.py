@@ -265,3 +265,18 @@ def capital(text: str) -> str:
     if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
         return text
     return text[:1].upper() + text[1:]
+
+
+def in_millimetres(length: Estimate) -> str:
+    """Format a length [m] in mm."""
+    return estimate(scaled(length, 1000.0), " mm", most=2)
+
+
+def in_degrees(angle: Estimate) -> str:
+    """Format an angle [rad] in degrees."""
+    return estimate(degrees(angle), "°", most=2)
+
+
+def in_percent(share: Estimate) -> str:
+    """Format a share in percent."""
+    return estimate(scaled(share, 100.0), " %", most=2)

@@ -117,6 +117,11 @@ def _number(value: Cell | Estimate | float) -> Cell | Estimate:
 AnyTable = Table[Any]
 
 
+def p_cell(p: float | None) -> PValue | None:
+    """Return the cell of a p-value; empty without one."""
+    return None if p is None else PValue(p)
+
+
 def typical(text: int, page: int) -> tuple[Digits, Digits]:
     """Return the digits that the typical interval of the column deserves, at most so many.
 

@@ -23,7 +23,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -49,11 +49,19 @@ from ..catalog.fleet import Fleet
 from ..common import formats
 from ..common.answer import beyond
 from ..common.estimate import Provenance
+from ..parts.body.show import point_table, shape_lines
+from ..parts.free_motion.show import local_waves_table, motion_table, wave_table
+from ..parts.frequency_response.show import frequency_table
+from ..parts.gaits.show import gait_joint_table, gait_table
+from ..parts.ground_contact.show import contact_lines
+from ..parts.heterogeneity.show import index_table
+from ..parts.shown import AnyTable
+from ..parts.tracking.show import tracking_table
 from ..results.analysis import Analysis
 from ..results.comparison import Comparison
 from ..results.experiment import Experiment
 from ..session.cycle_maps import CycleMaps
-from . import response_tables, tables
+from . import tables
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
 from .page_tables import (
@@ -69,7 +77,6 @@ from .page_tables import (
     typeset,
 )
 from .session_view import session_view
-from .text import contact_lines, shape_lines
 
 LARGEST_BYTES = 3_000_000
 """A page must open on a phone."""
@@ -206,6 +213,13 @@ def _without_control(value: object) -> object:
     return "\n".join(plain(line) for line in value.split("\n"))
 
 
+_PART_TABLES: tuple[Callable[..., AnyTable], ...] = (
+    *(point_table, local_waves_table, motion_table, wave_table, frequency_table),
+    *(gait_joint_table, gait_table, index_table, tracking_table),
+)
+"""Tables of parts, by which templates name them."""
+
+
 @cache
 def environment() -> Environment:
     """Return the templates, with their filters and what all pages share."""
@@ -222,7 +236,9 @@ def environment() -> Environment:
     for of in (*shared, softer, typeset, digits, sentence):
         made.filters[of.__name__] = of
     made.filters.update(decimals=formats.decimals_for, again=_commands_to_reproduce)
-    made.globals.update(tables=tables, responses=response_tables, grid=grid, escaped=escaped)
+    made.globals.update(tables=tables, grid=grid, escaped=escaped)
+    for table_of in _PART_TABLES:
+        made.globals[table_of.__name__] = table_of
     made.globals.update(num=number, est=estimate, p=p_value)
     script = _script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

@@ -22,6 +22,7 @@ from ..common.formats import degrees, estimate, short
 from ..parts.artefacts.result import KINDS, Artefact, Span
 from ..parts.joints.result import JointResult
 from ..parts.oscillators.result import ChainCoupling
+from ..parts.oscillators.show import chain_detail
 from ..results.analysis import Analysis
 from ..session.cycle_maps import CycleMaps
 from .bode import bode, cycle_drawings
@@ -30,7 +31,7 @@ from .page_tables import element, is_driven, joint_mark, key_figures, session_tr
 from .part_figures import draw
 from .segments import body_motion, segments
 from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
-from .text import chain_detail, shown_parts
+from .text import shown_parts
 
 CYCLES = 2.5
 """Gait cycles shown."""

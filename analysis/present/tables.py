@@ -9,12 +9,11 @@ names and types follow from the fields (:mod:`.data_frames`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 
 from ..common import formats
 from ..common.estimate import Estimate
-from ..common.formats import degrees, scaled
+from ..common.formats import degrees
 from ..compare.decisions import (
     SIGNIFICANT_DIFFERENCE,
     WORDS,
@@ -24,10 +23,8 @@ from ..compare.decisions import (
     signed,
     signed_difference,
 )
-from ..parts.body.result import BodyPoint, BodyResult
-from ..parts.heterogeneity.result import Index
 from ..parts.joints.result import JointResult
-from ..parts.shown import Column, Ends, PValue, ShownNumber, Table, typical
+from ..parts.shown import Column, ShownNumber, Table, p_cell, typical
 from ..results.analysis import Analysis
 from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, of_body
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
@@ -45,10 +42,6 @@ _NAMED = {
     True: (("gain", "gain, B over A"), ("lag", "lag, B minus A")),
     False: (("amplitude", "amplitude, B over A"), ("phase_lag", "phase lag, B minus A")),
 }
-
-
-def _p(p: float | None) -> PValue | None:
-    return None if p is None else PValue(p)
 
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
@@ -107,72 +100,6 @@ def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
     return Table(columns, joints, numbered=True, about=about)
 
 
-def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
-    """Head, middle and tail, for a terminal: measured, and the nulls beside it."""
-    columns: list[Column[tuple[BodyPoint, ...]]] = [
-        Column(f"body, {body.plane}", None, lambda points: points[0].place, kind="word"),
-        Column("link", None, lambda points: points[0].link, kind="word"),
-    ]
-    names = [("seen mm (95 %)", "phase° (95 %)"), *((f"{n} null mm", "phase°") for n in body.null)]
-    for k, (amplitude, phase) in enumerate(names):
-        columns += [
-            Column(amplitude, None, partial(_point, k, phase=False), (1, 1), spare=2 if k else 0),
-            Column(phase, None, partial(_point, k, phase=True), (1, 1), spare=1 if k else 0),
-        ]
-    return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
-
-
-def _point(k: int, points: tuple[BodyPoint, ...], *, phase: bool) -> Estimate:
-    return degrees(points[k].phase_rad) if phase else scaled(points[k].amplitude_m, 1000.0)
-
-
-def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
-    """Head, middle and tail, for the page: measured, and the nulls below it."""
-    rows: list[tuple[str, BodyPoint]] = []
-    for point in body.observed:
-        rows.append(("measured", point))
-        for name, nulls in body.null.items():
-            rows += [(f"perfect tracking, {name}", n) for n in nulls if n.place == point.place]
-    columns: list[Column[tuple[str, BodyPoint]]] = [
-        Column(None, "place", lambda row: row[1].place, kind="word"),
-        Column(None, "link", lambda row: row[1].link, kind="word"),
-        Column(None, "of", lambda row: row[0], kind="word"),
-        Column(None, "amplitude [mm]", lambda row: _point(0, row[1:], phase=False), (1, 1)),
-        Column(None, "phase [°]", lambda row: _point(0, row[1:], phase=True), (1, 1)),
-    ]
-    return Table(columns, rows)
-
-
-def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
-    """Heterogeneity indices."""
-
-    def value(index: Index) -> Estimate:
-        return scaled(Estimate(index.value, index.ci95), math.degrees(1) if rad(index) else 1.0)
-
-    def rad(index: Index) -> bool:
-        return index.unit == "rad"
-
-    def on_page(index: Index, number: float | None) -> ShownNumber:
-        unit = {"rad": "°", "1": ""}.get(index.unit, index.unit)
-        return ShownNumber(Estimate(number), formats.decimals_for([value(index)], least=0), unit)
-
-    def ends(index: Index) -> Ends | None:
-        ci95 = value(index).ci95
-        return None if ci95 is None else Ends(on_page(index, ci95[0]), on_page(index, ci95[1]))
-
-    columns: list[Column[tuple[str, Index]]] = [
-        Column("index", "index", lambda row: row[0], kind="code"),
-        Column(None, "what it measures", lambda row: row[1].label, kind="sentence"),
-        Column("value (95 %)", None, lambda row: value(row[1]), (4, 0)),
-        Column(None, "value", lambda row: on_page(row[1], value(row[1]).value)),
-        Column(None, "95 % interval", lambda row: ends(row[1])),
-        Column("unit", None, lambda row: "°" if rad(row[1]) else row[1].unit, spare=2),
-        Column("p", "p", lambda row: _p(row[1].p)),
-        Column("what", None, lambda row: row[1].label, kind="word", spare=1),
-    ]
-    return Table(columns, list(indices.items()))
-
-
 def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
     """Each joint against its mirror joint."""
     relative, most = formats.relative, typical(3, 5)
@@ -183,7 +110,7 @@ def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
             "gain % (95 %)", "gain [%]", lambda joint: relative(joint.log_gain_difference), most
         ),
         Column("lag° (95 %)", "lag [°]", lambda joint: degrees(joint.lag_difference_rad), most),
-        Column("p", "p", lambda joint: _p(joint.p)),
+        Column("p", "p", lambda joint: p_cell(joint.p)),
     ]
     return Table(columns, reversal.joints)
 
@@ -221,7 +148,7 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
         Column("B", "B", lambda difference: _side(difference, difference.b), spare=2),
         Column("B - A (95 %, all together)", None, signed_difference),
         Column(None, "B minus A", _difference),
-        Column("p (Holm)", "p (Holm)", lambda difference: _p(difference.p_holm)),
+        Column("p (Holm)", "p (Holm)", lambda difference: p_cell(difference.p_holm)),
         Column("in margins", None, lambda difference: f"{difference.size:.2g}", spare=1),
         Column(None, "size [margins]", lambda difference: difference.size, (0, 2)),
     ]
@@ -256,7 +183,7 @@ def named_table(comparison: Comparison) -> Table[NamedJoint]:
             for quantity, title in _NAMED[comparison.commanded]
         ),
         Column(None, "size [margins]", lambda joint: joint.size, (0, 1)),
-        Column(None, "p (Holm)", lambda joint: _p(joint.p_holm)),
+        Column(None, "p (Holm)", lambda joint: p_cell(joint.p_holm)),
     ]
     return Table(columns, comparison.named, numbered=True)
 

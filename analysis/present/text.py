@@ -13,41 +13,26 @@ from undulog.capture.common import console as text_table
 from undulog.capture.common.console import UNLIMITED, plain
 
 from ..common import formats
-from ..common.estimate import Estimate
-from ..parts.body.result import BodyShape, PlaneShape
-from ..parts.energy.result import EnergyResult
+from ..parts.artefacts.show import artefact_line
+from ..parts.body.show import body_table, shape_lines
+from ..parts.dead_band.show import dead_band_line
+from ..parts.energy.show import energy_lines
 from ..parts.free_motion.result import FreeMotion
+from ..parts.free_motion.show import local_waves_table, motion_table, wave_table
+from ..parts.frequency_response.show import frequency_table
 from ..parts.gait.show import gait_frequency
-from ..parts.ground_contact.result import GroundContact
-from ..parts.oscillators.result import ChainCoupling
+from ..parts.gaits.show import gait_table
+from ..parts.ground_contact.show import contact_lines
+from ..parts.heterogeneity.show import index_table
+from ..parts.oscillators.show import chain_detail
+from ..parts.over_time.show import over_time_lines
 from ..parts.shown import TERMINAL, AnyTable, Cell, Column, Ends, PValue, Shown, ShownNumber, Table
+from ..parts.tracking.show import tracking_table
 from ..results.analysis import Analysis
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
 from ..results.oscillators import BodyOscillators, ClosedLoop, LoopMode
 from . import tables
-from .response_tables import (
-    frequency_table,
-    gait_table,
-    local_waves_table,
-    motion_table,
-    tracking_table,
-    wave_table,
-)
-
-_ABOUT = {
-    "sensor": "Artefact of the sensor",
-    "sensor or joint": "Sensor or joint",
-    "sensor or limit": "Sensor or limit",
-    "record": "Artefact of the record",
-    "limit": "At a limit",
-}
-
-_SPANS = 3
-"""Stretches of an artefact that a line names at most."""
-
-_LIFTED = 0.9
-"""Where links are on the ground for more of a cycle, on the mean, nothing is lifted."""
 
 _PART = 0.5
 """Joints with this share of a pattern's largest are named."""
@@ -58,111 +43,14 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
     yield from shape_lines(analysis.body_shape)
     yield from contact_lines(analysis.ground_contact)
     if analysis.energy is not None:
-        yield from _energy(analysis.energy)
-    yield from _over_time(analysis)
-    yield from _dead_bands(analysis)
-    for artefact in analysis.artefacts:
-        spans = [f"{start:.2f} to {stop:.2f} s" for start, stop in artefact.spans_s[:_SPANS]]
-        more = len(artefact.spans_s) - _SPANS
-        times = ", ".join(spans) + (f" and {more} more" if more > 0 else "")
-        note = f" ({artefact.note})" if artefact.note else ""
-        where = f"{artefact.quantity} on {artefact.topic}" if artefact.topic else artefact.quantity
-        about = f"{plain(artefact.joint)}, {where}: {artefact.flag}{note}"
-        yield f"{_ABOUT[artefact.about]}: {about}{': ' if times else ''}{times}"
-
-
-def _dead_bands(analysis: Analysis) -> Iterator[str]:
-    """Yield a line for each joint with stick or play: its dead band at both reversals."""
+        yield from energy_lines(analysis.energy)
+    if analysis.over_time is not None and analysis.gait.frequency_hz.value is None:
+        yield from over_time_lines(analysis.over_time)
     for joint in analysis.joints:
-        band = joint.dead_band
-        if band is None:
-            continue
-        ends = [
-            (
-                Estimate(reversal.travel_rad, reversal.travel_ci95),
-                Estimate(reversal.step_rad, reversal.step_ci95),
-            )
-            for reversal in (band.top, band.bottom)
-        ]
-        ends = ends[:1] if ends[0] == ends[1] else ends
-        widths = ", ".join(
-            formats.estimate(formats.degrees(travel), "°", most=2) for travel, _ in ends
-        )
-        steps = ", ".join(formats.estimate(formats.degrees(step), "°", most=2) for _, step in ends)
-        where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
-        lag = math.degrees(band.lag_change_rad)
-        yield (
-            f"Dead band: {plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
-            f"the command travels {widths} before the joint moves and catches up by {steps}; "
-            f"of gain and lag the dead band alone makes {band.gain_change:.3f} and {lag:.1f}°"
-        )
-
-
-def _energy(energy: EnergyResult) -> Iterator[str]:
-    cost = energy.transport
-    named = (("E_net", cost.net), ("E_abs", cost.abs), ("E_el", cost.el))
-    if costs := [
-        f"{name} {formats.estimate(estimate, most=4)}" for name, estimate in named if estimate.value
-    ]:
-        way = formats.estimate(cost.distance_m, " m", most=3)
-        yield f"Cost of transport E/(m g d): {', '.join(costs)}, over {way}"
-    if energy.unknown is not None:
-        yield formats.sentence(energy.unknown)
-    closure = energy.closure
-    if closure is not None and closure.mechanical_balance is not None:
-        parts = [f"balance {100 * closure.mechanical_balance:.3f} %"]
-        parts += [] if closure.net is None else [f"E_net {100 * closure.net:.2f} %"]
-        parts += [] if closure.el is None else [f"E_el {100 * closure.el:.2f} %"]
-        yield f"Against the twin's ledger, in % of E_abs: {', '.join(parts)}"
-
-
-def _over_time(analysis: Analysis) -> Iterator[str]:
-    """Yield the range of gain and lag over cycles if there is no single gait."""
-    if analysis.over_time is None or analysis.gait.frequency_hz.value is not None:
-        return
-    cycles = [
-        (gain, lag, rate)
-        for joint in analysis.over_time.joints
-        for gain, lag, rate in zip(joint.gain, joint.lag_rad, joint.frequency_hz, strict=True)
-        if gain is not None and lag is not None
-    ]
-    gains, lags, rates = (sorted(cycle[k] for cycle in cycles) for k in range(3))
-    low, high = (formats.degrees(Estimate(lag)).value for lag in (lags[0], lags[-1]))
-    yield (
-        f"Cycle by cycle, by the logged phase: {len(analysis.over_time.joints)} joints, gain "
-        f"{formats.number(gains[0], 2)} to {formats.number(gains[-1], 2)}, lag "
-        f"{formats.number(low, 1)} to {formats.number(high, 1)}°, {rates[0]:.2f} to "
-        f"{rates[-1]:.2f} Hz (--json has each)"
-    )
-
-
-def chain_detail(chain: ChainCoupling) -> Iterable[str]:
-    """Yield sentences on a chain of oscillators, the answer first."""
-    where = f"Oscillators, {chain.plane}:"
-    if not chain.identifiable:
-        record = f" To decide it, record {chain.record}." if chain.record else ""
-        yield f"{where} coupling not identifiable: {chain.why}.{record}"
-        return
-    number = chain.condition_number
-    condition = formats.MISSING if number is None else f"{number:.3g}"
-    strongest = max(chain.links, key=lambda link: link.K.value or 0.0)
-    yield (
-        f"{where} {len(chain.links)} couplings identified (condition number {condition}); "
-        f"the strongest is {strongest.source} on {strongest.target}, "
-        f"K = {formats.estimate(strongest.K, ' 1/s')}."
-    )
-    couplings = [
-        f"{link.source} on {link.target} {formats.estimate(link.K)}" for link in chain.links
-    ]
-    yield f"K [1/s]: {'; '.join(couplings)}."
-    if fed := [
-        oscillator for oscillator in chain.oscillators if oscillator.feedback.value is not None
-    ]:
-        values = ", ".join(
-            f"{oscillator.name} {formats.estimate(oscillator.feedback)}" for oscillator in fed
-        )
-        yield f"Feedback of each servo's own angle [1/s]: {values}."
-    yield f"Method: {chain.why}, {chain.duration_s:.3g} s of phases."
+        if joint.dead_band is not None:
+            yield dead_band_line(joint.name, joint.dead_band)
+    for artefact in analysis.artefacts:
+        yield artefact_line(artefact)
 
 
 def body_detail(body: BodyOscillators) -> Iterable[str]:
@@ -297,9 +185,9 @@ def _tables(analysis: Analysis) -> list[AnyTable]:
     if analysis.free_motion is not None and analysis.free_motion.joints:
         shown = _of_motion(analysis.free_motion)
     if analysis.body is not None:
-        shown.append(tables.body_table(analysis.body))
+        shown.append(body_table(analysis.body))
     if any(index.value is not None for index in analysis.heterogeneity.values()):
-        shown.append(tables.index_table(analysis.heterogeneity))
+        shown.append(index_table(analysis.heterogeneity))
     return shown
 
 
@@ -392,63 +280,3 @@ def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:
         f"{'+' if math.cos(turn[k]) >= 0 else formats.MINUS}{joints[k]}"
         for k in np.flatnonzero(share >= _PART * share.max()).tolist()
     )
-
-
-def shape_lines(shape: BodyShape | None) -> Iterator[str]:
-    """Yield a sentence for each plane, and one on the travel of a cycle."""
-    if shape is None:
-        return
-    for plane in shape.planes:
-        yield _plane_line(plane)
-    travel = shape.travel
-    if travel is not None:
-        yield (
-            f"Travel of a cycle: {_mm(travel.forward_m)} forward, {_mm(travel.left_m)} to the "
-            f"left, turn {_degrees(travel.turn_rad)} (virtual chassis; the links are "
-            f"{1000 * travel.length_m:.0f} mm along and {1000 * travel.width_m:.0f} mm across from "
-            "their mean, root mean square)."
-        )
-
-
-def contact_lines(contact: GroundContact | None) -> Iterator[str]:
-    """Yield a sentence on which links are on the ground, where they are lifted."""
-    if contact is None:
-        return
-    links = sorted(contact.links, key=lambda link: link.share.value or 0.0)
-    mean = sum(link.share.value or 0.0 for link in links) / len(links)
-    if mean > _LIFTED:
-        return
-    least, most = (f"{_percent(link.share)} ({link.link})" for link in (links[0], links[-1]))
-    right = " to ".join(f"{100 * accuracy:.0f}" for accuracy in contact.twin_accuracy)
-    yield (
-        f"Ground contact, from the joints' {contact.source}: links are on the ground {least} to "
-        f"{most} of a cycle, {100 * mean:.0f} % on the mean. In the twin contact and lift are "
-        f"recognised in {right} %, by the gait (chance: 50 %)."
-    )
-
-
-def _plane_line(plane: PlaneShape) -> str:
-    curve = plane.serpenoid
-    where = "" if plane.plane is None else f", {plane.plane}"
-    shares = ", ".join(_percent(mode.share) for mode in plane.modes)
-    speed = formats.estimate(curve.speed, " joints/s", most=2)
-    if curve.speed_m_s.value is not None:
-        speed += f" ({formats.estimate(curve.speed_m_s, ' m/s', most=3)})"
-    return (
-        f"Body shape{where}: modes with {shares} of the variance; serpenoid of "
-        f"{_degrees(curve.amplitude_rad)}, {_degrees(curve.wave_number)} a joint, "
-        f"{formats.estimate(curve.waves, most=3)} waves at {speed}, offset "
-        f"{_degrees(curve.offset_rad)}, leaves {_percent(curve.unexplained)} unexplained."
-    )
-
-
-def _mm(metres: Estimate) -> str:
-    return formats.estimate(formats.scaled(metres, 1000.0), " mm", most=2)
-
-
-def _degrees(angle: Estimate) -> str:
-    return formats.estimate(formats.degrees(angle), "°", most=2)
-
-
-def _percent(share: Estimate) -> str:
-    return formats.estimate(formats.scaled(share, 100.0), " %", most=2)
