@@ -50,7 +50,7 @@ def log(tmp_path):
 
 
 def test_it_takes_about_forty_lines():
-    assert len([line for line in CODE.splitlines() if line.strip()]) <= 42
+    assert len([line for line in CODE.splitlines() if line.strip()]) <= 44
 
 
 def test_it_is_found_by_suffix_and_by_content_and_written(log, tmp_path):
@@ -93,7 +93,6 @@ def test_what_is_wrong_with_a_file_is_its_own_words(log, tmp_path):
     assert "is no log of the bench: it doesn't begin with 'BENCH 1" in refused
 
 
-NAMED = 'Format("bench", "log of the bench", (".bench",), sniff'
 UNUSABLE = {
     "no format": ("FORMAT = 3\n", POINT, "is no undulog.capture.exchange.formats.format.Format"),
     "no import": ("import nowhere\n", POINT, "can't be loaded: No module named 'nowhere'"),
@@ -106,7 +105,11 @@ UNUSABLE = {
     "title": (CODE.replace('"log of the bench"', "None"), POINT, "its 'title' has to be a text"),
     "suffixes": (CODE.replace('(".bench",)', '".bench"'), POINT, "its 'suffixes' have to be"),
     "capital": (CODE.replace('(".bench",)', '(".BENCH",)'), POINT, "in small letters"),
-    "sniff": (CODE.replace(NAMED, NAMED.replace("sniff", "0.5")), POINT, "its 'sniff' has to be"),
+    "sniff": (
+        CODE.replace('(".bench",), sniff', '(".bench",), 0.5'),
+        POINT,
+        "its 'sniff' has to be",
+    ),
     "read": (CODE.replace("TableReader(read)", "read"), POINT, "its 'read' has to be a reader"),
     "write": (CODE.replace("TableWriter(write)", "write"), POINT, "its 'write' has to be a wri"),
     "neither": (
@@ -127,6 +130,7 @@ FAILING = {
 
 @pytest.mark.parametrize(("code", "point", "message"), list(UNUSABLE.values()), ids=UNUSABLE)
 def test_a_format_that_can_not_be_used_is_named(code, point, message, log, tmp_path):
+    assert (code, point) != (CODE, POINT)
     packages = [package(tmp_path / "format", code, point)]
     trouble = run("import", log, "-o", tmp_path / "x.mcap", packages=packages, code=2)
     assert message in trouble
@@ -136,6 +140,7 @@ def test_a_format_that_can_not_be_used_is_named(code, point, message, log, tmp_p
 
 @pytest.mark.parametrize(("code", "message"), list(FAILING.values()), ids=FAILING)
 def test_a_format_that_fails_is_named(code, message, log, tmp_path):
+    assert code != CODE
     packages = [package(tmp_path / "format", code)]
     trouble = run("import", log, "-o", tmp_path / "x.mcap", packages=packages, code=1)
     assert message in trouble
