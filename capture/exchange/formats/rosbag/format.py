@@ -11,17 +11,19 @@ if TYPE_CHECKING:
     from ...import_options import ImportOptions
     from ...reports import ExportReport, ImportReport
 
-_MAGIC = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0")
+_MCAP, _ROS1, _DATABASE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0", b"SQLite format 3"
 
 
 def _sniff(head: bytes, path: Path) -> float:
-    """Recognise MCAP, ROS 1, the schema of an SQLite bag, and a folder of rosbag2."""
+    """Recognise MCAP, a folder, and, as what opens them goes by the suffix, .bag and .db3 files."""
     from ....log.file.bag_metadata import is_rosbag2
 
     if path.is_dir():
         return float(is_rosbag2(path))
-    database = head.startswith(b"SQLite format 3") and b"topic_id" in head
-    return float(head.startswith(_MAGIC) or database)
+    kind = path.suffix.lower()
+    ros1 = kind == ".bag" and head.startswith(_ROS1)
+    ros2 = kind == ".db3" and head.startswith(_DATABASE) and b"topic_id" in head
+    return float(head.startswith(_MCAP) or ros1 or ros2)
 
 
 def _read(source: Path, output: Path, options: ImportOptions) -> list[ImportReport]:

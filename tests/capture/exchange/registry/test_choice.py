@@ -19,9 +19,10 @@ from PIL import Image
 from pyarrow import feather, parquet
 from scipy.io import savemat, wavfile
 
-from campaign.foreign import tensor
+from campaign.foreign import write_tensors
 from support.paths import ROOT
 from support.written_frames import log_messages
+from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.frame_reader import FrameReader
 from undulog.capture.exchange.registry.registry import FORMATS, format_of
@@ -32,13 +33,6 @@ MESSAGES = [
     can.Message(timestamp=1.7e9 + 0.01 * k, arbitration_id=k, data=bytes(k % 9)) for k in range(50)
 ]
 TABLE = pd.DataFrame({"time": T, "joint1_pos": np.sin(T)})
-
-
-def write_tensors(path):
-    pickled = b"\x80\x02}(" + b"Vtime\n" + tensor("0", 100, (100,), (1,)) + b"u."
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("run/data.pkl", pickled)
-        archive.writestr("run/data/0", T.tobytes())
 
 
 def write_bag(path):
@@ -61,7 +55,7 @@ FOREIGN = {
     "parquet": lambda path: parquet.write_table(pa.Table.from_pandas(TABLE), path),
     "npz": lambda path: np.savez(path, time=T, q=T),
     "mat": lambda path: savemat(path, {"time": T, "q": T}),
-    "pt": write_tensors,
+    "pt": lambda path: write_tensors(path, {"time": T, "dof_pos": np.sin(T)}),
 }
 NAMES = {
     "log": "candump",
@@ -102,9 +96,22 @@ def test_a_trace_that_is_compressed(suffix, tmp_path):
     assert format_of(packed)[0].name == format_of(path)[0].name
 
 
-def test_a_trace_of_another_suffix_is_imported(tmp_path, command):
-    path = log_messages(tmp_path / "run.log", MESSAGES).rename(tmp_path / "trace.txt")
-    command("import", path, "-o", tmp_path / "run.mcap", "-r", "arcsnake-joint")
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_file_of_another_suffix_is_imported_alike(kind, tmp_path, command):
+    path = tmp_path / f"run.{kind}"
+    FOREIGN[kind](path)
+    copies = [tmp_path / "own.mcap", tmp_path / "other.mcap"]
+    robot = ["-r", "arcsnake-joint"] if isinstance(format_of(path)[1], FrameReader) else []
+    command("import", path, "-o", copies[0], *robot)
+    command("import", path.rename(tmp_path / "run.dat"), "-o", copies[1], *robot)
+    counts = [counts_of(session) for session in copies]
+    assert counts[0] == counts[1]
+    assert sum(counts[0].values())
+
+
+def counts_of(session):
+    with Session.open(session) as opened:
+        return {topic: channel.count for topic, channel in opened.channels.items()}
 
 
 def test_folders(tmp_path):
@@ -115,7 +122,8 @@ def test_folders(tmp_path):
     names = [format_of(tmp_path / name)[0].name for name in ("set", "bag", "tables")]
     assert names == ["lerobot", "rosbag2", "folder"]
     (database,) = (tmp_path / "bag").glob("*.db3")
-    assert format_of(database.rename(tmp_path / "x.sqlite"))[0].name == "rosbag2"
+    with pytest.raises(ImportFormatError, match="looks like an SQLite database"):
+        format_of(database.rename(tmp_path / "x.sqlite"))  # what opens bags goes by the suffix
 
 
 def write_zip(path):
