@@ -13,8 +13,10 @@ from .format import Format
 
 
 def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
-    """Find the schema, which is in the first page."""
-    return float(head.startswith(b"SQLite format 3") and b"arbitration_id" in head)
+    """Find the schema, which is in the first page of what python-can writes."""
+    if not head.startswith(b"SQLite format 3"):
+        return 0.0
+    return 1.0 if b"arbitration_id" in head else 0.1
 
 
 @contextmanager

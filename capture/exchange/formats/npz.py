@@ -20,12 +20,11 @@ from .format import Format
 _NPY_HEADER = 1 << 17
 """Bytes that the header of an array may take."""
 
-_ENTRY_NAME = slice(30, 4096)
-"""Where the name of a zip's first entry is."""
-
 
 def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
-    return 0.9 * (head.startswith(b"PK") and b".npy" in head[_ENTRY_NAME])
+    if not head.startswith(b"PK"):
+        return 0.0
+    return 0.9 if b".npy" in head else 0.1  # entries that are named further on
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:

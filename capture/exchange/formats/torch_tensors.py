@@ -36,12 +36,11 @@ _TENSORS = {"torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor"}
 _PARAMETER = "torch._utils _rebuild_parameter"
 _ORDERED = "collections OrderedDict"
 
-_ENTRY_NAME = slice(30, 4096)
-"""Where the name of a zip's first entry is."""
-
 
 def _sniff(head: bytes, path: Path) -> float:  # noqa: ARG001 - as all formats have it
-    return 0.9 * (head.startswith(b"PK") and b"data.pkl" in head[_ENTRY_NAME])
+    if not head.startswith(b"PK"):
+        return 0.0
+    return 0.9 if b"data.pkl" in head else 0.1  # entries that are named further on
 
 
 @dataclass(frozen=True)

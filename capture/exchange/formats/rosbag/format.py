@@ -21,9 +21,8 @@ def _sniff(head: bytes, path: Path) -> float:
     if path.is_dir():
         return float(is_rosbag2(path))
     kind = path.suffix.lower()
-    ros1 = kind == ".bag" and head.startswith(_ROS1)
-    ros2 = kind == ".db3" and head.startswith(_DATABASE) and b"topic_id" in head
-    return float(head.startswith(_MCAP) or ros1 or ros2)
+    magic = (kind == ".bag" and _ROS1) or (kind == ".db3" and _DATABASE) or _MCAP
+    return float(head.startswith(magic))
 
 
 def _read(source: Path, output: Path, options: ImportOptions) -> list[ImportReport]:

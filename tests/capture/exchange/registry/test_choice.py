@@ -114,6 +114,21 @@ def counts_of(session):
         return {topic: channel.count for topic, channel in opened.channels.items()}
 
 
+def test_what_a_file_of_its_suffix_shows_late_does_not_matter(tmp_path):
+    """Names of entries behind 64 KiB of numbers, a schema behind other tables."""
+    with zipfile.ZipFile(tmp_path / "x.pt", "w") as archive:
+        archive.writestr("run/data/0", bytes(1 << 17))
+        archive.writestr("run/data.pkl", b"}.")
+    with sqlite3.connect(tmp_path / "x.db") as base:
+        for k in range(400):
+            columns = ", ".join(f"column{k:03d}_{n:04d} REAL" for n in range(30))
+            base.execute(f"CREATE TABLE a{k} ({columns})")
+    base.close()
+    log_messages(tmp_path / "x.db", MESSAGES)
+    assert b"arbitration_id" not in (tmp_path / "x.db").read_bytes()[: 1 << 16]
+    assert [format_of(tmp_path / name)[0].name for name in ("x.pt", "x.db")] == ["pt", "can_db"]
+
+
 def test_folders(tmp_path):
     (tmp_path / "set/meta").mkdir(parents=True)
     (tmp_path / "set/meta/info.json").write_text("{}")
