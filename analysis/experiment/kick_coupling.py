@@ -230,16 +230,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         )
     if size.why is not None:
         warn(size.why)
-    if not held:
-        warn(
-            "how far from the gait the matrices hold isn't known: record held-out runs in which "
-            "all joints' phases deviate by random amounts up to 0.15 rad"
-        )
-    elif reached is None:
-        warn(
-            "the matrices don't predict the smallest held-out pattern twice as well as 'each joint "
-            "keeps its response'"
-        )
+    _warn_of_range(held, reached, warn)
     return LocalCoupling(
         identifiable=True,
         why=f"central differences of {len(kicks)} kicks around one gait",
@@ -265,6 +256,24 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         scatter=_scatter(matrices),
         kick_size=size,
     )
+
+
+def _warn_of_range(held: Sequence[HeldOut], reached: float | None, warn: Warn) -> None:
+    """Warn where it isn't known how far from the gait the matrices hold, or it is nowhere.
+
+    Args:
+        reached: Largest deviation up to which they predict [rad]; None for none.
+    """
+    if not held:
+        warn(
+            "how far from the gait the matrices hold isn't known: record held-out runs in which "
+            "all joints' phases deviate by random amounts up to 0.15 rad"
+        )
+    elif reached is None:
+        warn(
+            "the matrices don't predict the smallest held-out pattern twice as well as 'each joint "
+            "keeps its response'"
+        )
 
 
 def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:

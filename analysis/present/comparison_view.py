@@ -21,13 +21,8 @@ from ..catalog.fleet import sentence as change_sentence
 from ..common import formats
 from ..common.estimate import Estimate
 from ..common.formats import estimate, scaled, short
-from ..compare.decisions import (
-    RESPONSE,
-    SIGNIFICANT_DIFFERENCE,
-    WORDS,
-    margin_text,
-    signed_difference,
-)
+from ..compare.decisions import RESPONSE, SIGNIFICANT_DIFFERENCE, WORDS
+from ..compare.words import margin_text, signed_difference
 from ..results.comparison import BODY, Comparison, of_body
 from .page_tables import Fact, Trial, joint_mark
 from .svg import (

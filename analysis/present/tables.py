@@ -14,15 +14,8 @@ from collections.abc import Callable, Sequence
 from ..common import formats
 from ..common.estimate import Estimate
 from ..common.formats import degrees
-from ..compare.decisions import (
-    SIGNIFICANT_DIFFERENCE,
-    WORDS,
-    decimals_of,
-    in_people_units,
-    people_unit,
-    signed,
-    signed_difference,
-)
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS
+from ..compare.words import decimals_of, in_people_units, people_unit, signed, signed_difference
 from ..parts.joints.result import JointResult
 from ..parts.shown import Column, ShownNumber, Table, p_cell, typical
 from ..results.analysis import Analysis

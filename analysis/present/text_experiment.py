@@ -12,7 +12,8 @@ from undulog.capture.common.console import UNLIMITED, plain
 from ..common import formats
 from ..common.estimate import Estimate
 from ..common.formats import scaled
-from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS
+from ..compare.words import margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
 from ..experiment.best_linear import multisine_method
 from ..experiment.body_connection import CONNECTION_METHOD, connection_detail

@@ -14,15 +14,13 @@ from undulog.analysis.estimators.trends import Trend
 from undulog.analysis.response.changes import Pace, ResponseChanges
 from undulog.analysis.response.fitting import (
     GaitFit,
-    _mixed,
-    _needed,
     _usable,
     _warn_changes,
     _warn_groups,
     _warn_undriven,
-    _within,
     fit_gait,
 )
+from undulog.analysis.response.gait_warnings import _mixed, _needed, _within
 from undulog.analysis.response.groups import Groups, MixedTone, Unresolved
 
 T = np.arange(1000) / 100
