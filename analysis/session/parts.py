@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from pkgutil import iter_modules
 from typing import Any
 
@@ -21,12 +22,10 @@ Their warnings come in this order; what a part reads is measured before it in an
 
 def _listed() -> tuple[Part[Any], ...]:
     listed: list[Part[Any]] = []
-    for folder in iter_modules(parts.__path__):
-        if folder.ispkg and any(
-            module.name == "part" for module in iter_modules([f"{parts.__path__[0]}/{folder.name}"])
-        ):
-            module = import_module(f"{parts.__name__}.{folder.name}.part")
-            listed += module.PARTS
+    for folder in iter_modules(parts.__path__, f"{parts.__name__}."):
+        name = f"{folder.name}.part"
+        if folder.ispkg and find_spec(name) is not None:
+            listed += import_module(name).PARTS
     ranks = {name: rank for rank, name in enumerate(FIRST)}
     return tuple(sorted(listed, key=lambda part: (ranks.get(part.name, len(FIRST)), part.name)))
 

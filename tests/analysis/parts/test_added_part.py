@@ -82,6 +82,25 @@ def test_it_stands_in_text_json_page_and_csv(session, tmp_path):
         assert output.stdout == "['following_error']\n"
 
 
+def test_a_folder_beside_the_others_is_enough(session, tmp_path):
+    """A part of undulog itself is found in its folder: nothing else names it."""
+    folder = tmp_path / "more/following_error"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "part.py").write_text(f"{CODE}\n\nPARTS = (PART,)\n")
+    (tmp_path / "sitecustomize.py").write_text(
+        "import undulog.analysis.parts as parts\n"
+        f"parts.__path__.append({str(tmp_path / 'more')!r})\n"
+    )
+    assert "error [rad]" in run("analyse", session, packages=[tmp_path])
+    result = json.loads(run("analyse", session, "--json", packages=[tmp_path]))
+    assert result["following_error"]["joints"]
+    run("analyse", session, "--csv", tmp_path / "tables", packages=[tmp_path])
+    assert (tmp_path / "tables/following_error.csv").exists()
+    run("report", session, "-o", tmp_path / "page.html", packages=[tmp_path])
+    assert 'id="part-following_error"' in (tmp_path / "page.html").read_text()
+
+
 UNUSABLE = {
     "no part": ("PART = 3\n", POINT, "is no undulog.analysis.parts.part.Part"),
     "no import": ("import nowhere\n", POINT, "can't be loaded: No module named 'nowhere'"),
