@@ -25,6 +25,7 @@ from undulog.analysis.results.comparison import Comparison, ModelledAnalysis
 from undulog.analysis.results.experiment import Experiment
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycle_maps import cycle_maps
+from undulog.analysis.session.parts import BEYOND_THE_GAIT
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import DataError, UndulogError
@@ -121,9 +122,7 @@ def computed(session: SessionView, options: Options | None = None) -> Layer:
         The layer, with a note where there are no numbers.
     """
     try:
-        measured = measure_session(
-            session, options, without=("dead_band", "body", "ground_contact")
-        )
+        measured = measure_session(session, options, without=BEYOND_THE_GAIT)
     except UndulogError as error:
         return Layer(None, notes=(f"not analysed: {error}",))
     analysis = measured.analysis

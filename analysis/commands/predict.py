@@ -204,6 +204,7 @@ def _runs(
     from undulog.capture import Session
 
     from ..session.analyse import measure_session
+    from ..session.parts import BEYOND_THE_GAIT
     from ..session.runs import gait_run
     from .analyse import chosen
 
@@ -211,9 +212,7 @@ def _runs(
     runs: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:
-            fitted = measure_session(
-                session, options, without=("dead_band", "body", "ground_contact")
-            )
+            fitted = measure_session(session, options, without=BEYOND_THE_GAIT)
             runs.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
     return tuple(runs)
 

@@ -29,6 +29,7 @@ from ..results.analysis import Analysis
 from ..results.comparison import BODY, MetadataChange
 from ..session.analyse import measure_session
 from ..session.measurement import SessionMeasurement
+from ..session.parts import UNCOMPARED
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span
@@ -235,7 +236,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    measured = measure_session(session, options, without=("dead_band",))
+    measured = measure_session(session, options, without=UNCOMPARED)
     analysis = measured.analysis
     run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)

@@ -20,6 +20,7 @@ from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..common.answer import percent
 from ..common.remarks import Remarks
 from ..session.analyse import measure_session
+from ..session.parts import BEYOND_THE_GAIT
 from ..signals.columns import read_columns
 
 PURE = 0.01
@@ -62,7 +63,7 @@ def base_gait(session: SessionView) -> BaseGait:
     Raises:
         UsageError: If it commands no steady gait of sines.
     """
-    gait = measure_session(session, without=("dead_band", "body", "ground_contact")).gait
+    gait = measure_session(session, without=BEYOND_THE_GAIT).gait
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
     if gait.others:

@@ -65,11 +65,9 @@ def measure_session(
     """Analyse one session, and keep the intermediate data.
 
     Args:
-        without: Names of parts that nothing asks for: ``dead_band`` takes a third of the time of a
-            short session, ``body`` and ``ground_contact`` two fifths
-            of that of a long one. A motion without commands is
-            known by the body's, which is then measured all the same. Parts of other packages are
-            measured where nothing is left out.
+        without: Names of parts that nothing asks for (:data:`.analysis.session.parts.UNCOMPARED`).
+            A motion without commands is known by the body's, which is then measured all the same.
+            Parts of other packages are measured where nothing is left out.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.

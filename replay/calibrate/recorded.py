@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.parts import BEYOND_THE_GAIT
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError, UsageError
@@ -179,7 +180,7 @@ def joined(sessions: Sequence[Recorded]) -> MeasuredAngles:
 def _omega(session: SessionView) -> float | None:
     """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
     try:
-        gait = measure_session(session, without=("dead_band", "body", "ground_contact")).gait
+        gait = measure_session(session, without=BEYOND_THE_GAIT).gait
     except UndulogError:  # a session without a gait can be fitted, too
         return None
     return None if gait is None or not gait.driven else gait.fit.omega

@@ -26,6 +26,7 @@ import tomlkit
 from undulog.analysis.common.estimate import Interval
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.parts import UNCOMPARED
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.config import read
@@ -257,7 +258,7 @@ def _results(setting: Setting, job: Job, path: Path) -> Row:
     scenario = scenario_of(setting, job.changes).changed(seed=job.seed)
     recording = record(scenario, path, kernels=setting.kernels)
     with Session.open(path) as session:
-        result = measure_session(session, options, without=("dead_band",)).analysis  # no column
+        result = measure_session(session, options, without=UNCOMPARED).analysis  # no column
     return {
         "session_id": recording.session_id,
         "robot": scenario.robot.name,

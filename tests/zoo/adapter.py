@@ -16,6 +16,7 @@ import numpy as np
 
 from undulog.analysis.common.answer import Verdict
 from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.parts import BEYOND_THE_GAIT
 from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
 from undulog.capture.log.columns.topics import Channel
@@ -152,7 +153,7 @@ def stated(signals: Signals) -> Said:
     """Return what undulog states of a session."""
     try:
         session = cast("SessionView", MemorySession(signals))
-        measured = measure_session(session, without=("dead_band", "body"))
+        measured = measure_session(session, without=BEYOND_THE_GAIT)
     except UndulogError as error:
         return Said((), (), False, False, True, sentence="", refused=str(error))
     answer = measured.analysis.answer
