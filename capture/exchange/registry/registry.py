@@ -8,6 +8,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
 from ...common.errors import DataError, ImportFormatError, UndulogError, UsageError, raised_as
@@ -23,16 +24,28 @@ from .table_folder import table_folder
 if TYPE_CHECKING:
     from ..table_file import TableFile
 
-_MODULES = (
-    "candump", "blf.format", "asc", "can_msgs", "trc", "can_db", "mf4", "csv_table", "can_csv",
-    "parquet", "npz", "mat", "torch_tensors", "rosbag.format", "lerobot.format", "tum", "foxglove",
-    "plotjuggler",
-)  # fmt: skip
-"""The table: modules of formats; of those that fit a file alike, the first is taken."""
+_FOLDER = "undulog.capture.exchange.formats"
 
-FORMATS: tuple[Format, ...] = tuple(
-    import_module(f"undulog.capture.exchange.formats.{name}").FORMAT for name in _MODULES
+_FIRST = (
+    *("candump", "blf", "asc", "can_msgs", "trc", "can_db", "mf4", "csv_table", "can_csv"),
+    *("parquet", "npz", "mat", "torch_tensors", "rosbag", "lerobot", "tum", "foxglove"),
 )
+"""Of formats that fit a file alike the first of these is taken, then others by their names."""
+
+
+def _listed() -> tuple[Format, ...]:
+    """Return the formats of this package, each from its file or folder."""
+    modules = {
+        entry.name: import_module(f"{_FOLDER}.{entry.name}{'.format' if entry.ispkg else ''}")
+        for entry in iter_modules(import_module(_FOLDER).__path__)
+        if entry.name != "format"  # what a format is
+    }
+    ranks = {name: rank for rank, name in enumerate(_FIRST)}
+    names = sorted(modules, key=lambda name: (ranks.get(name, len(_FIRST)), name))
+    return tuple(modules[name].FORMAT for name in names)
+
+
+FORMATS = _listed()
 """The formats of this package."""
 
 WIDE = "wide"

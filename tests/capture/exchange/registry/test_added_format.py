@@ -77,6 +77,20 @@ def test_it_is_found_by_suffix_and_by_content_and_written(log, tmp_path):
         assert signal.t_ns.tolist() == [int(t.replace(".", "")) for t in TIMES]
 
 
+def test_a_file_beside_the_others_is_enough(log, tmp_path):
+    """A format of undulog itself is found in its file: nothing else names it."""
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more/bench.py").write_text(CODE)
+    (tmp_path / "sitecustomize.py").write_text(
+        "import undulog.capture.exchange.formats as formats\n"
+        f"formats.__path__.append({str(tmp_path / 'more')!r})\n"
+    )
+    run("import", log, "-o", tmp_path / "run.mcap", packages=[tmp_path])
+    with Session.open(tmp_path / "run.mcap") as opened:
+        signal = opened.joints("/joint_states").signal("joint1")
+        np.testing.assert_array_equal(signal.values, ANGLES)
+
+
 def test_without_the_package_the_file_is_of_no_format(log, tmp_path):
     refused = run("import", log, "-o", tmp_path / "x.mcap", packages=[], code=1)
     assert "run.bench: is of no format that can be imported: it looks like text" in refused
