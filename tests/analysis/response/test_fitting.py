@@ -15,12 +15,16 @@ from undulog.analysis.response.changes import Pace, ResponseChanges
 from undulog.analysis.response.fitting import (
     GaitFit,
     _usable,
-    _warn_changes,
-    _warn_groups,
-    _warn_undriven,
     fit_gait,
 )
-from undulog.analysis.response.gait_warnings import _mixed, _needed, _within
+from undulog.analysis.response.gait_warnings import (
+    _mixed,
+    _needed,
+    _within,
+    warn_changes,
+    warn_groups,
+    warn_undriven,
+)
 from undulog.analysis.response.groups import Groups, MixedTone, Unresolved
 
 T = np.arange(1000) / 100
@@ -142,7 +146,7 @@ def changes_of(trend=Trend.STEADY, cycles=16, effective=9.0, excess=0.5, **field
 
 def words(changes, pace=None):
     notes = []
-    _warn_changes(changes, pace, ["a", "b"], notes.append)
+    warn_changes(changes, pace, ["a", "b"], notes.append)
     return notes
 
 
@@ -188,7 +192,7 @@ def test_cycles_needed_are_tens_of_which_six_are_independent():
 
 def test_joints_that_are_not_driven_are_named_by_why():
     notes = []
-    _warn_undriven(held=["a"], astray=["b", "c"], unusable=[], warn=notes.append)
+    warn_undriven(held=["a"], astray=["b", "c"], unusable=[], warn=notes.append)
     assert notes == [
         "1 joint is held still by the command, gain and lag are null: a",
         "2 joints are commanded something else than the common rhythm, gain and lag are null: b, c",
@@ -201,7 +205,7 @@ def test_frequencies_that_are_too_close_are_named():
     close = Unresolved(("a", "b"), ("c",), 0.95, 1.0)
     groups = Groups((), 1.0, (close, replace(close, left=())))
     notes = []
-    _warn_groups(groups, [fit], 12.0, notes.append)
+    warn_groups(groups, [fit], 12.0, notes.append)
     assert notes[0] == (
         "one group or two can't be decided: 3 joints are commanded at 0.95 to 1 Hz, closer than "
         "1.5/T in 12 s; gain and lag of c are null (record 30 s or more)"
@@ -210,7 +214,7 @@ def test_frequencies_that_are_too_close_are_named():
     assert "; they are analysed as one group (record" in notes[1]
     notes.clear()
     other = replace(fit, omega=6.0)
-    _warn_groups(Groups((), 1.0), [fit, other], 100.0, notes.append)
+    warn_groups(Groups((), 1.0), [fit, other], 100.0, notes.append)
     (text,) = notes
     assert "commensurate within 1.5/T: 0.9549 Hz - 0.4775 Hz falls on 0.4775 Hz; 2 x" in text
 
