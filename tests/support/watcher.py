@@ -80,7 +80,8 @@ def end(run, stderr, name, limit_s):
 
 def main(stderr, run):
     """Watch a run until its pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is the run's own
+    for stop in (signal.SIGINT, signal.SIGHUP):  # are the run's own, which may go on
+        signal.signal(stop, signal.SIG_IGN)
     name, left_s, limit_s, text, before = "", 0.0, 0.0, b"", {}
     while True:
         if select.select([0], [], [], LOOK_S)[0]:
