@@ -53,6 +53,15 @@ def streaming(file, path):
         yield viewer, task_of
 
 
+def ends_with_a_message(path, read_back):
+    """Whether Rerun, which writes behind what it has received, is within no message."""
+    try:
+        read_back(path)
+    except RuntimeError:
+        return False
+    return True
+
+
 @pytest.fixture
 def receive(tmp_path, read_back):
     """Streams a session to a Rerun process that writes what it takes; returns notes and file."""
@@ -61,6 +70,7 @@ def receive(tmp_path, read_back):
         path = tmp_path / "received.rrd"
         with streaming(file, path) as (viewer, task_of):
             notes = progressive.show_session(task_of(Told(), layer), viewer, StopRequest())
+            wait_for(lambda: ends_with_a_message(path, read_back), "the last message")
         return notes, read_back(path, identity)
 
     return stream
