@@ -1,13 +1,4 @@
-"""The answer of a session: which joints do not follow, which stand out, and the rest's shape.
-
-With it comes what qualifies it: artefacts and dead bands of joints, and remarks on what is missing
-or doubtful, by what they change for the reader.
-
-Whoever computes something takes a function of one sentence (:data:`.Warn`). A
-plain sentence is a warning. A :class:`Lacking` is a warning that stands first; a :class:`Note`
-changes nothing that a reader does: an optional topic that was not recorded, a figure that does not
-apply.
-"""
+"""The answer of a session: which joints do not follow, which stand out, and the rest's shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Remarks on an analysis: warnings, notes, refusals, and what leads the answer."""
+"""Remarks on an analysis: warnings, notes, refusals, and what leads the answer.
+
+Whoever computes something takes a function of one sentence (:data:`.Warn`). A plain sentence is a
+warning. A :class:`Lacking` is a warning that stands first; a :class:`Note` changes nothing that a
+reader does: an optional topic that was not recorded, a figure that does not apply.
+"""
 
 from __future__ import annotations
 

@@ -7,9 +7,9 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ParamSpec, TypeVar, cast
 
+from undulog.capture.common.entry_points import added_objects
 from undulog.capture.common.errors import DataError, UndulogError, UsageError
 
 from ..parts.part import Part
@@ -35,27 +35,22 @@ def added_parts() -> tuple[Part[Any], ...]:
     """
     taken = {part.name for part in PARTS} | {entry.name for entry in dataclasses.fields(Analysis)}
     added: list[Part[Any]] = []
-    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
-        part = _loaded(point)
-        if part.name in taken:
-            raise UsageError(f"{_whose(point)} claims a key that is taken; give it another name")
+    for name, label, loaded in added_objects(ENTRY_POINTS, "part"):
+        part = _usable(name, label, loaded)
+        if name in taken:
+            raise UsageError(f"{label} claims a key that is taken; give it another name")
         taken.add(part.name)
         added.append(part)
     return tuple(added)
 
 
-def _loaded(point: EntryPoint) -> Part[Any]:
-    try:
-        part: object = point.load()
-    except Exception as error:
-        raise UsageError(f"{_whose(point)} can't be loaded: {error}; remove its package") from error
+def _usable(name: str, label: str, part: object) -> Part[Any]:
     if not isinstance(part, Part):
-        raise UsageError(f"{_whose(point)} is no undulog.analysis.parts.part.Part")
+        raise UsageError(f"{label} is no undulog.analysis.parts.part.Part")
     added = cast("Part[Any]", part)
-    if added.result is None or added.name != point.name or not _NAME.fullmatch(added.name):
+    if added.result is None or added.name != name or not _NAME.fullmatch(added.name):
         raise UsageError(
-            f"{_whose(point)} needs a 'result' and the name of its entry point: small letters, "
-            "digits and _"
+            f"{label} needs a 'result' and the name of its entry point: small letters, digits and _"
         )
     show = None if added.show is None else _guarded(added.name, added.show)
     return dataclasses.replace(added, measure=_guarded(added.name, added.measure), show=show)
@@ -75,10 +70,6 @@ def _guarded(name: str, function: Callable[P, T]) -> Callable[P, T]:
             ) from error
 
     return call
-
-
-def _whose(point: EntryPoint) -> str:
-    return f"the part {point.name!r} ({point.value})"
 
 
 def checked(part: Part[Any], result: object) -> object:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
+from ...common.entry_points import added_objects
 from ...common.errors import UsageError
 from ..formats.format import Format, Reader, Writer
 
@@ -30,29 +30,25 @@ def added_formats(taken: Collection[str] = ()) -> tuple[Format, ...]:
     """
     names = set(taken)
     added: list[Format] = []
-    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
-        form = _loaded(point)
-        if form.name in names:
-            raise UsageError(f"{_whose(point)} has a name that is taken; give it another one")
+    for name, label, loaded in added_objects(ENTRY_POINTS, "format"):
+        form = _checked(name, label, loaded)
+        if name in names:
+            raise UsageError(f"{label} has a name that is taken; give it another one")
         names.add(form.name)
         added.append(form)
     return tuple(added)
 
 
-def _loaded(point: EntryPoint) -> Format:
-    try:
-        form: object = point.load()
-    except Exception as error:
-        raise UsageError(f"{_whose(point)} can't be loaded: {error}; remove its package") from error
+def _checked(name: str, label: str, form: object) -> Format:
     if not isinstance(form, Format):
-        raise UsageError(f"{_whose(point)} is no undulog.capture.exchange.formats.format.Format")
-    if form.name != point.name or not _NAME.fullmatch(form.name):
+        raise UsageError(f"{label} is no undulog.capture.exchange.formats.format.Format")
+    if form.name != name or not _NAME.fullmatch(form.name):
         raise UsageError(
-            f"{_whose(point)}: its 'name' has to be that of its entry point, of small letters, "
+            f"{label}: its 'name' has to be that of its entry point, of small letters, "
             "digits, - and _"
         )
     if fault := _fault(vars(form)):
-        raise UsageError(f"{_whose(point)}: {fault}")
+        raise UsageError(f"{label}: {fault}")
     return form
 
 
@@ -74,7 +70,3 @@ def _fault(fields: dict[str, Any]) -> str:
 
 def _is_suffix(suffix: object) -> bool:
     return isinstance(suffix, str) and _SUFFIX.fullmatch(suffix) is not None
-
-
-def _whose(point: EntryPoint) -> str:
-    return f"the format {point.name!r} ({point.value})"
