@@ -133,6 +133,18 @@ _OWN = """
 """
 
 
+_Config: TypeAlias = dict[str, str | bool | int | float | list[str]]
+
+_CONFIG: _Config = {"memory_limit": "800MB", "autoinstall_known_extensions": "false"}
+
+_BOUNDED: _Config = {
+    **_CONFIG,
+    "memory_limit": "500MB",
+    "temp_directory": "",  # nothing is written beside the catalogue
+    "autoload_known_extensions": "false",
+}
+
+
 def _with_interval(*names: str) -> list[str]:
     return [column for name in names for column in (name, f"{name}_low", f"{name}_high")]
 
@@ -337,16 +349,6 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         }
         for position, joint in enumerate(names)
     ]
-
-
-_Config: TypeAlias = dict[str, str | bool | int | float | list[str]]
-_CONFIG: _Config = {"memory_limit": "800MB", "autoinstall_known_extensions": "false"}
-_BOUNDED: _Config = {
-    **_CONFIG,
-    "memory_limit": "500MB",
-    "temp_directory": "",  # nothing is written beside the catalogue
-    "autoload_known_extensions": "false",
-}
 
 
 @contextmanager

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 
+_make: list[Callable[[], Any]] = []
+
+
 def leaves_out_zero(ci95: Interval | None) -> bool:
     """Return whether a value differs from zero beyond doubt.
 
@@ -75,9 +78,6 @@ class PictureProtocol(Protocol):
     def caption(self) -> str: ...  # noqa: D102
     def to_svg(self) -> str: ...  # noqa: D102
     def save(self, path: Path | str, *, force: bool = False) -> Path: ...  # noqa: D102
-
-
-_make: list[Callable[[], Any]] = []
 
 
 def present_with(make: Callable[[], Any]) -> None:

@@ -44,6 +44,9 @@ LINEAR = 1e-7
 on linearly with it, and what is neglected, a share of its square, is rounding."""
 
 
+_Group = tuple[list[int], list[Series]]
+
+
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cosine and sine of one set of angles.
 
@@ -401,7 +404,6 @@ def fit_at(
     return _gathered(solved, len(series), omega, model, 0.0)
 
 
-_Group = tuple[list[int], list[Series]]
 _Part = tuple[list[int], Solved]
 
 

@@ -50,6 +50,9 @@ _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 SUFFIX = ".csv"
 
 
+Frames = dict[str, pd.DataFrame]
+
+
 def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.DataFrame:
     """Return dataclasses of one kind as a table.
 
@@ -115,9 +118,6 @@ def _columns(kind: type[Any]) -> list[str]:
 
 def _number(value: float | None) -> float:
     return float("nan") if value is None else value
-
-
-Frames = dict[str, pd.DataFrame]
 
 
 def frames_of(result: object) -> Frames:  # noqa: PLR0911 - one kind of result a case

@@ -31,6 +31,9 @@ MOST_IN_CELLS = 16
 _FEELS = "the joint that feels the torque"
 
 
+_Rows = Sequence[Sequence[float]]
+
+
 @dataclass(frozen=True)
 class Entries:
     """A matrix with its names.
@@ -125,9 +128,6 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
     count = len(coupling.matrix)
     rows = names if len(names) == count else tuple(str(k + 1) for k in range(count))
     return (_entries("Coupling", "response over command", rows, coupling.matrix),)
-
-
-_Rows = Sequence[Sequence[float]]
 
 
 def _entries(

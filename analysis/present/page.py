@@ -105,6 +105,13 @@ _FLAGS = (
 )
 
 
+_PART_TABLES: tuple[Callable[..., AnyTable], ...] = (
+    *(point_table, local_waves_table, motion_table, wave_table, frequency_table),
+    *(gait_joint_table, gait_table, index_table, tracking_table),
+)
+"""Tables of parts, by which templates name them."""
+
+
 def render(
     result: Analysis | Experiment | Comparison,
     session: SessionView | None = None,
@@ -211,13 +218,6 @@ def _without_control(value: object) -> object:
     if isinstance(value, Markup) or not isinstance(value, str):
         return value
     return "\n".join(plain(line) for line in value.split("\n"))
-
-
-_PART_TABLES: tuple[Callable[..., AnyTable], ...] = (
-    *(point_table, local_waves_table, motion_table, wave_table, frequency_table),
-    *(gait_joint_table, gait_table, index_table, tracking_table),
-)
-"""Tables of parts, by which templates name them."""
 
 
 @cache

@@ -57,6 +57,12 @@ _ROOT = re.compile(r":root\s*\{([^}]*)\}")
 _VARIABLE = re.compile(r"--([\w-]+):\s*([^;]+);")
 
 
+_number = count(1)
+"""Figures are numbered, so that two of a notebook share no identifiers."""
+
+Pictures = dict[str, "Callable[[str], Drawing]"]
+
+
 def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
     """Write a result as JSON; see :meth:`.analysis.common.estimate.PresentedResult.save`."""
     check_output(path, (".json",), "the result file is JSON; end its name in .json", force=force)
@@ -336,10 +342,6 @@ def _style() -> str:
     return folder.joinpath("templates", "style.css").read_text(encoding="utf-8")
 
 
-_number = count(1)
-"""Figures are numbered, so that two of a notebook share no identifiers."""
-
-
 def picture(result: object, what: str | None = None) -> Picture:
     """Draw a result; see :meth:`.analysis.common.estimate.PresentedResult.plot`.
 
@@ -362,9 +364,6 @@ def picture(result: object, what: str | None = None) -> Picture:
     except ImportError as error:
         raise MissingExtraError("plot()", "report", "matplotlib") from error
     return Picture(drawing.svg, drawing.caption)
-
-
-Pictures = dict[str, "Callable[[str], Drawing]"]
 
 
 def pictures_of(result: object) -> Pictures:

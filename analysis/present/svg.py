@@ -124,6 +124,9 @@ COMMAND: dict[str, Any] = {"color": REFERENCE, "linewidth": 2.4, "linestyle": (0
 """Line behind that of a joint, whose colour some readers can't tell from grey."""
 
 
+_kept: ContextVar[dict[str, Figure] | None] = ContextVar("figures", default=None)
+
+
 @contextmanager
 def drawing(height_in: float, width_in: float = WIDTH_IN) -> Generator[Figure]:
     """Open an empty figure in the page's own style, whatever the caller's matplotlib is set to.
@@ -134,9 +137,6 @@ def drawing(height_in: float, width_in: float = WIDTH_IN) -> Generator[Figure]:
         _mpl.rcdefaults()
         _mpl.rcParams.update(STYLE)
         yield _Figure(figsize=(width_in, height_in), layout="constrained")
-
-
-_kept: ContextVar[dict[str, Figure] | None] = ContextVar("figures", default=None)
 
 
 @contextmanager

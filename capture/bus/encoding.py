@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 _MOST_BYTES = 8
 
 
+BusValue: TypeAlias = tuple[str, Quantity, str]
+"""What a value is: name of a joint or sensor, quantity, and axis of a vector quantity, else ""."""
+
+
 def poll_frames(robot: Robot) -> FrameArray:
     """Return the frames that request the robot's state.
 
@@ -57,10 +61,6 @@ def poll_frames(robot: Robot) -> FrameArray:
         data = word.to_bytes(message.length, "little").ljust(_MOST_BYTES, b"\0")
         frame["data"] = np.frombuffer(data, np.uint8)
     return frames
-
-
-BusValue: TypeAlias = tuple[str, Quantity, str]
-"""What a value is: name of a joint or sensor, quantity, and axis of a vector quantity, else ""."""
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ its data must reach the disk, and goes on where this gives up."""
 _FAULTS = ("malformed", "error_frames", "reconnects")
 
 
+_Text = Annotated[str, Parameter(show_default=False)]
+
+
 def record(
     *sources: Annotated[str, Parameter(name="SOURCE")],
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
@@ -174,9 +177,6 @@ def _lines(report: RecordReport) -> Iterator[str]:
         facts = [f"{counts['frames']} frames", lost, *counted_faults(counts)]
         yield f"  {name}: {', '.join(facts)}"
     yield from (f"  reason: {reason}" for reason in report.reasons)
-
-
-_Text = Annotated[str, Parameter(show_default=False)]
 
 
 def counted_faults(source: Mapping[str, Any]) -> list[str]:

@@ -32,6 +32,12 @@ _GAP = 2
 _NARROWEST = 6
 
 
+Warn = Callable[[str], None]
+
+Cells = Sequence[tuple[str, str]]
+"""Text and style of each cell of a row."""
+
+
 def plain(text: str) -> str:
     r"""Escape the control characters of a text.
 
@@ -149,13 +155,6 @@ def output_width() -> int:
     from shutil import get_terminal_size
 
     return get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
-
-
-Warn = Callable[[str], None]
-
-
-Cells = Sequence[tuple[str, str]]
-"""Text and style of each cell of a row."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,11 @@ _SHARES = 16
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+_Item = TypeVar("_Item")
+
+_Result = TypeVar("_Result")
+
+
 @dataclass(frozen=True)
 class Priority:
     """Result of a request for priority.
@@ -143,10 +148,6 @@ def threads_or_default(threads: int | None) -> int:
     if threads < 1:
         raise UsageError(f"threads={threads}: give 1 or more, or None for one a core")
     return threads
-
-
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
 
 
 def in_threads(

@@ -40,6 +40,11 @@ MORE, FAULTY = -1, 0
 _LONGEST = 4096  # of a Dynamixel packet; its length field holds 65535
 
 
+Judge = Callable[[bytes, int, bool], int]
+"""Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY; with the
+last argument no more bytes will come."""
+
+
 @dataclass(frozen=True)
 class Register:
     """One register of a servo.
@@ -165,11 +170,6 @@ def dynamixel_packet(servo: int, instruction: int, parameters: bytes = b"") -> b
     body = (bytes((instruction,)) + parameters).replace(PLAIN, STUFFED)
     whole = b"\xff\xff\xfd\x00" + bytes((servo,)) + (len(body) + 2).to_bytes(2, "little") + body
     return whole + crc16(whole).to_bytes(2, "little")
-
-
-Judge = Callable[[bytes, int, bool], int]
-"""Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY; with the
-last argument no more bytes will come."""
 
 
 def _judge_feetech(data: bytes, at: int, ended: bool) -> int:

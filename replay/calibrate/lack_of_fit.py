@@ -59,6 +59,9 @@ LEVEL = 0.05
 """Family-wise p below which the twin counts as not fitting."""
 
 
+_Slices: TypeAlias = Sequence[slice]
+
+
 @dataclass(frozen=True)
 class JointMisfit:
     """One joint.
@@ -294,9 +297,6 @@ def halves(problem: LeastSquares, x: FloatArray, sessions: Sequence[int] = ()) -
     by_session = pairs[0] is not long_enough[compared.index((p, unfitted_rad))]
     fitted_rad = _rms(problem.residuals)
     return Unfitted(min(1.0, len(compared) * p), fitted_rad, unfitted_rad, by_session)
-
-
-_Slices: TypeAlias = Sequence[slice]
 
 
 def _pairs(lengths: Sequence[int], sessions: Sequence[int]) -> Iterator[tuple[_Slices, _Slices]]:

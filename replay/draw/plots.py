@@ -68,6 +68,10 @@ _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 _ANGLES = (COMMANDED, MEASURED, ERROR)
 
 
+Rows = Callable[[str, IntArray], slice]
+"""Of an entity and the times of its samples: which of them are drawn."""
+
+
 def is_foreign(session: SessionView) -> bool:
     """Return whether a session was neither recorded nor imported by undulog.
 
@@ -181,10 +185,6 @@ def _tables(session: SessionView, topic: str) -> Iterator[Any]:
         session.forget()
         if len(table):
             yield table
-
-
-Rows = Callable[[str, IntArray], slice]
-"""Of an entity and the times of its samples: which of them are drawn."""
 
 
 def every_row(_entity: str, t_ns: IntArray) -> slice:

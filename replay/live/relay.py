@@ -57,6 +57,10 @@ _GRACE_S = 3.0
 _LOOK_S = 0.05
 
 
+Connect = Callable[[BoundedStream], None]
+"""Gives a recording stream its sink."""
+
+
 class Datagram(NamedTuple):
     """One datagram, its head read.
 
@@ -179,10 +183,6 @@ def _answers(path: Path) -> bool:
         except OSError:
             return False
     return True
-
-
-Connect = Callable[[BoundedStream], None]
-"""Gives a recording stream its sink."""
 
 
 @dataclass

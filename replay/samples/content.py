@@ -43,6 +43,10 @@ _SHORT = {
 _UNITS = {"degC": "°C"}
 
 
+Tab = Literal["session", "cycles", "mean-cycle"]
+"""The tabs of the layout."""
+
+
 @dataclass(frozen=True)
 class PlottedSeries:
     """An entity with one plotted line a joint.
@@ -248,10 +252,6 @@ class Layer:
             computed: The session's analysis, or a note why there is none.
         """
         return Layer(computed.analysis, computed.steady, self.named, (*self.notes, *computed.notes))
-
-
-Tab = Literal["session", "cycles", "mean-cycle"]
-"""The tabs of the layout."""
 
 
 def signal_title(topic: str, unit: str) -> str:

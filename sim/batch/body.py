@@ -66,6 +66,10 @@ _QUARTER_1, _QUARTER_2 = 1.5707963267341256, 6.077100506506192e-11  # pi/2 in tw
 _SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
 
+Lanes = Callable[..., None]
+"""A loop over the runs of a block."""
+
+
 def of_lanes(rows: FloatArray) -> None:
     """Refuse rows of another width than a block's; on a GPU nothing: a thread has one lane.
 
@@ -115,10 +119,6 @@ def _sine_cosine(x: float) -> tuple[float, float]:
     sign = _ONE - _TWO * (halves - _TWO * floor(halves * _HALF))
     odd = quarters != _TWO * halves
     return sign * (c if odd else s), sign * (-s if odd else c)
-
-
-Lanes = Callable[..., None]
-"""A loop over the runs of a block."""
 
 
 class JointPasses(NamedTuple):

@@ -71,6 +71,9 @@ SAMPLE_ROWS = 9
 _ZERO, _HALF, _ONE, _TINY = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 1e-37)])
 
 
+_digest = hashlib.sha256()
+
+
 @njit(error_model="numpy")
 def _servo(
     joint: FloatArray,
@@ -361,7 +364,6 @@ def _entry(sources: str) -> Callable[..., None]:
     return run_block
 
 
-_digest = hashlib.sha256()
 for _module in (body, compiled_kernels):
     _digest.update(Path(str(_module.__file__)).read_bytes())
 run_block = _entry(_digest.hexdigest())

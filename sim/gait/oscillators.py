@@ -58,6 +58,14 @@ _STRONGEST = float(CONTROL_RATE_HZ)  # greatest coupling, feedback and rate of a
 _SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
+Numbers: TypeAlias = float | tuple[float, ...]
+"""One number for all, or one for each."""
+
+Rates: TypeAlias = Annotated[Numbers, at_least(-_STRONGEST), at_most(_STRONGEST)]
+
+PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
+
+
 @dataclass(frozen=True)
 class NeighbourCoupling:
     """What neighbours do to each other.
@@ -261,12 +269,6 @@ class Approach:
             target: R, shape (n,).
         """
         self._target = target
-
-
-Numbers: TypeAlias = float | tuple[float, ...]
-"""One number for all, or one for each."""
-Rates: TypeAlias = Annotated[Numbers, at_least(-_STRONGEST), at_most(_STRONGEST)]
-PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
 
 
 class OscillatorKind(StrEnum):

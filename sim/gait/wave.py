@@ -28,6 +28,10 @@ JOINT_VALUE_NAMES = ("A", "offset", "phase")
 joint's command is A sin(phase) + offset."""
 
 
+Frequency: TypeAlias = Annotated[float, above(0.0), at_most(CONTROL_RATE_HZ / 4)]
+"""A frequency that the control rate can carry [Hz]."""
+
+
 def smoothstep(x: float) -> float:
     """Rise from 0 to 1 with no slope at either end, 3 x^2 - 2 x^3.
 
@@ -146,10 +150,6 @@ class Wave(StrEnum):
 
     HEAD_TO_TAIL = "head-to-tail"
     TAIL_TO_HEAD = "tail-to-head"
-
-
-Frequency: TypeAlias = Annotated[float, above(0.0), at_most(CONTROL_RATE_HZ / 4)]
-"""A frequency that the control rate can carry [Hz]."""
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,10 @@ _NO_SHAPE = -1
 _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
+# Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
+_pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity
+
+
 @contextlib.contextmanager
 def _quiet_stderr() -> Generator[None]:
     """Drop what C code prints on stderr: the engine greets with its build time on import."""
@@ -55,8 +59,6 @@ with _quiet_stderr():
     import pybullet
 
 
-# Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
-_pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity
 _angle, _rate = itemgetter(0), itemgetter(1)
 
 

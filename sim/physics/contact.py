@@ -27,6 +27,10 @@ _NEXT, _LAST = frozen(np.array([1, 2, 0])), frozen(np.array([2, 0, 1]))
 _TINY = 1e-300  # makes 0/0 a zero
 
 
+PerNewton: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Friction along (tangential, normal) for a load of 1 N, given the slip, both of shape (2, n)."""
+
+
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products; ``numpy.cross`` costs six times as much on short arrays.
 
@@ -93,10 +97,6 @@ def normal_force(
     """
     force = np.maximum(stiffness * penetration + damping * rate, 0.0)
     return np.multiply(force, np.heaviside(penetration, 0.0), out=out)
-
-
-PerNewton: TypeAlias = Callable[[FloatArray], FloatArray]
-"""Friction along (tangential, normal) for a load of 1 N, given the slip, both of shape (2, n)."""
 
 
 def _ellipse(mu: FloatArray, slip_speed: float) -> PerNewton:

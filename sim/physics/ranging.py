@@ -46,6 +46,9 @@ _SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
+_Model = TypeVar("_Model")
+
+
 class RayCaster:
     """The obstacles of a world, ready for rays."""
 
@@ -142,9 +145,6 @@ def _boxes(shapes: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArr
     enter = np.maximum.reduce([np.broadcast_to(slab[0], x.shape) for slab in slabs])
     leave = np.minimum.reduce([np.broadcast_to(slab[1], x.shape) for slab in slabs])
     return _hit(enter, leave)
-
-
-_Model = TypeVar("_Model")
 
 
 class Ranging(Generic[_Model]):

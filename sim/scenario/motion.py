@@ -39,6 +39,11 @@ GaitParameters: TypeAlias = Serpentine | DelayBlocks | OscillatorChains
 """Gait parameters of a scenario."""
 
 
+PlaneParameters: TypeAlias = PlaneGait | DelayLine | OscillatorChain
+
+Share: TypeAlias = Annotated[float, at_least(0.0), at_most(1.0)]
+
+
 def generator(parameters: GaitParameters, robot: Robot, *, per_joint: bool = False) -> Generator:
     """The generator of a gait, at time zero with straight joints.
 
@@ -61,7 +66,6 @@ class GaitKind(StrEnum):
     OSCILLATORS = "oscillators"
 
 
-PlaneParameters: TypeAlias = PlaneGait | DelayLine | OscillatorChain
 _KINDS: dict[GaitKind, tuple[type[GaitParameters], type[PlaneParameters]]] = {
     GaitKind.SERPENTINE: (Serpentine, PlaneGait),
     GaitKind.DELAY_BLOCKS: (DelayBlocks, DelayLine),
@@ -161,9 +165,6 @@ def _numbers(part: StrictTable, declaration: Declared, count: int | None) -> Num
     elements = {f"{part.key(declaration.key)}[{i}]": entry for i, entry in enumerate(entries)}
     listed = StrictTable(elements, "", part.faults)
     return tuple(listed.number(name, *declaration.bounds) for name in elements)
-
-
-Share: TypeAlias = Annotated[float, at_least(0.0), at_most(1.0)]
 
 
 class ControllerKind(StrEnum):

@@ -32,6 +32,9 @@ STREAM = 2
 _TRIES = 1000  # places tried for each cylinder
 
 
+Seed: TypeAlias = Annotated[int, at_least(0)]
+
+
 class Closest(NamedTuple):
     """Where a segment and a shape are nearest.
 
@@ -352,9 +355,6 @@ def _row(values: Sequence[float]) -> FloatArray:
 
 def _rows(pairs: Sequence[tuple[float, float]]) -> FloatArray:
     return frozen(np.array(pairs, dtype=np.float64).reshape(-1, 2).T)
-
-
-Seed: TypeAlias = Annotated[int, at_least(0)]
 
 
 @dataclass(frozen=True)

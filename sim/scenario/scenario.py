@@ -42,6 +42,15 @@ LONGEST_S = 86400.0
 _PLAIN = ("duration_s", "settle_s", "seed", "epoch_s", "physics_rate_hz", "engine")
 
 
+Length: TypeAlias = Annotated[float, at_least(1 / CONTROL_RATE_HZ), at_most(LONGEST_S)]
+"""Length of a run [s]."""
+
+PhysicsRate: TypeAlias = Annotated[int, at_least(2 * CONTROL_RATE_HZ)]
+
+Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
+"""Unix time from 2001 on [s]: viewers misread stamps near zero."""
+
+
 class EngineKind(StrEnum):
     """The engines there are, each named after its package."""
 
@@ -173,13 +182,6 @@ def _link_fields(table: StrictTable) -> dict[str, float]:
     given = {MASS_FACTOR: table.number(MASS_FACTOR, above(0.0))} if MASS_FACTOR in table else {}
     table.close()
     return given
-
-
-Length: TypeAlias = Annotated[float, at_least(1 / CONTROL_RATE_HZ), at_most(LONGEST_S)]
-"""Length of a run [s]."""
-PhysicsRate: TypeAlias = Annotated[int, at_least(2 * CONTROL_RATE_HZ)]
-Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
-"""Unix time from 2001 on [s]: viewers misread stamps near zero."""
 
 
 @dataclass(frozen=True)

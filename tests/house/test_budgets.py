@@ -69,3 +69,23 @@ def test_functions_are_short():
 def test_few_functions_are_nested_deeply():
     depths = [depth_of(node) for path in SOURCES for node in functions_of(path)]
     assert sum(depth >= DEEP for depth in depths) <= DEEP_SHARE * len(depths)
+
+
+def test_constants_stand_above_the_functions():
+    """Except those that are made by a function or class of their module."""
+    below = []
+    for path in SOURCES:
+        ours, after = set(), False
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                ours.add(node.name)
+                after |= isinstance(node, ast.FunctionDef)
+            elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                names = {target.id for target in targets if isinstance(target, ast.Name)}
+                used = {name.id for name in ast.walk(node.value) if isinstance(name, ast.Name)}
+                if used & ours:
+                    ours |= names
+                elif after and names:
+                    below.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert below == []

@@ -176,8 +176,9 @@ class Recorded:
         from rerun.chunk import RrdReader
 
         self._reader = RrdReader(path)
-        stores = [store for store in self._reader.recordings() if store.recording_id == identity]
-        self._chunks = self._reader.stream(store=next(iter(stores), None)).to_chunks()
+        stores = self._reader.recordings()
+        chosen = [store for store in stores if identity in (None, store.recording_id)]
+        self._chunks = self._reader.stream(store=next(iter(chosen), None)).to_chunks()
 
     @property
     def stores(self):

@@ -92,6 +92,9 @@ MOST_RATE = 50.0
 """Rate that no joint of a robot without description exceeds [rad/s]."""
 
 
+_Found = Iterator[tuple[str, str, tuple[Span, ...], str]]
+
+
 @dataclass(frozen=True)
 class PositionJumps:
     """What a position does that no joint can do.
@@ -319,9 +322,6 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
 
     samples = sum(signal.t_ns.size for key in QUANTITIES for signal in columns.of(key).values())
     return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples, session.forget)))
-
-
-_Found = Iterator[tuple[str, str, tuple[Span, ...], str]]
 
 
 def _of_joint(joint: _Joint, origin_ns: int) -> _Found:

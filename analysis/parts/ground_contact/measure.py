@@ -63,6 +63,10 @@ OPPOSITE = 0.8
 """Torques of the other sign whose residuals are smaller than so much of them have a wrong sign."""
 
 
+_Cycle: TypeAlias = tuple[list[Series], list[Series], FloatArray]
+"""Angles, torques, and ends of the parts of one cycle."""
+
+
 def link_loads(
     robot: Robot, angles: FloatArray, torques: FloatArray, up: FloatArray
 ) -> tuple[FloatArray, float]:
@@ -212,10 +216,6 @@ def ground_contact(
         warn(Note(f"no ground contact: {error}"))
         return None
     return None if len(loads) < MIN_CYCLES else GroundContact(source, _links(robot, loads))
-
-
-_Cycle: TypeAlias = tuple[list[Series], list[Series], FloatArray]
-"""Angles, torques, and ends of the parts of one cycle."""
 
 
 def _cycles(

@@ -33,6 +33,15 @@ _FIRST = (
 """Of formats that fit a file alike the first of these is taken, then others by their names."""
 
 
+WIDE = "wide"
+"""What ``--to`` names for a table with a column for each joint and quantity."""
+
+_HEAD = 1 << 16
+"""Bytes of a file that are looked at."""
+
+_GZIP = b"\x1f\x8b"
+
+
 def _listed() -> tuple[Format, ...]:
     """Return the formats of this package, each from its file or folder."""
     modules = {
@@ -48,13 +57,6 @@ def _listed() -> tuple[Format, ...]:
 FORMATS = _listed()
 """The formats of this package."""
 
-WIDE = "wide"
-"""What ``--to`` names for a table with a column for each joint and quantity."""
-
-_HEAD = 1 << 16
-"""Bytes of a file that are looked at."""
-
-_GZIP = b"\x1f\x8b"
 
 _SURE, _LEAST = 0.5, 0.01
 """A file of another suffix is of a format that fits it so well at least, and a folder."""

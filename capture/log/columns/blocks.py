@@ -59,6 +59,9 @@ _LARGEST_COPIED = 2048
 in the cache."""
 
 
+Window = tuple[int | None, int | None]
+
+
 def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
     """Yield items in order, each taken from the iterable before it is needed.
 
@@ -188,9 +191,6 @@ def _alone(log_file: LogFile, block: Block) -> _Found:
     except LogError as error:
         return error
     return data, Placed(block, base, stop)
-
-
-Window = tuple[int | None, int | None]
 
 
 @dataclass(frozen=True)

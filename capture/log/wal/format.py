@@ -24,7 +24,9 @@ import fcntl
 import os
 import re
 import struct
+import time
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -38,6 +40,8 @@ from ...common.errors import LogWriteError
 from ...common.part_files import present_path, remove_opened
 
 LOCK_NAME = "recorder.lock"
+LOCK_TRIES, LOCK_PAUSE_S = 100, 0.001
+"""Attempts at a lock, and the pause between them [s]: that of `is_live` lasts microseconds."""
 
 MAGIC = b"\x89UWAL1\r\n"
 MARK = 0xA5
@@ -62,6 +66,27 @@ MESSAGES, DEFINITIONS = 0, 1
 _NAME = re.compile(r"(def-)?(\d{6,19})\.seg")
 
 
+Definition = Header | Schema | Channel | Metadata | Attachment
+"""A definition, as a record of the MCAP library."""
+
+RecordFields = tuple[int, int, int, int, int, int, int]
+"""Position, kind, mark, channel id, sequence, log time, publish time: :class:`RecordHead` without
+its length, as a plain tuple, for the hot path."""
+
+_KINDS: dict[type[Definition], int] = {
+    Header: Opcode.HEADER,
+    Schema: Opcode.SCHEMA,
+    Channel: Opcode.CHANNEL,
+    Metadata: Opcode.METADATA,
+    Attachment: Opcode.ATTACHMENT,
+}
+
+_TYPES = {kind: record for record, kind in _KINDS.items()}
+
+STREAM_KINDS = {MESSAGES: frozenset({int(Opcode.MESSAGE)}), DEFINITIONS: frozenset(_TYPES)}
+"""The kinds of record that a stream has."""
+
+
 class WalLock:
     """A lock that a recorder holds from the creation of its log to the end."""
 
@@ -78,7 +103,7 @@ class WalLock:
         except OSError as error:
             raise LogWriteError(folder, f"can't be written: {error.strerror}") from error
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(self._file)
             if not os.path.samestat(self._path.lstat(), os.fstat(self._file)):
                 raise BlockingIOError  # of a recorder that has just ended; another one has begun
         except OSError as error:
@@ -99,6 +124,22 @@ class WalLock:
         os.close(self._file)
 
 
+def _lock(opened: int) -> None:
+    """Take an exclusive lock beside whoever asks `is_live`, which holds a shared one briefly.
+
+    Raises:
+        BlockingIOError: If a recorder holds it.
+    """
+    for _ in range(LOCK_TRIES):
+        with suppress(BlockingIOError):
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)  # refused beside a recorder
+        fcntl.flock(opened, fcntl.LOCK_UN)
+        time.sleep(LOCK_PAUSE_S)
+    raise BlockingIOError
+
+
 def is_live(folder: Path) -> bool:
     """Whether a recorder is writing a log now; always False on a file system without locks."""
     try:
@@ -112,28 +153,6 @@ def is_live(folder: Path) -> bool:
     finally:
         os.close(opened)
     return False
-
-
-Definition = Header | Schema | Channel | Metadata | Attachment
-"""A definition, as a record of the MCAP library."""
-
-
-RecordFields = tuple[int, int, int, int, int, int, int]
-"""Position, kind, mark, channel id, sequence, log time, publish time: :class:`RecordHead` without
-its length, as a plain tuple, for the hot path."""
-
-_KINDS: dict[type[Definition], int] = {
-    Header: Opcode.HEADER,
-    Schema: Opcode.SCHEMA,
-    Channel: Opcode.CHANNEL,
-    Metadata: Opcode.METADATA,
-    Attachment: Opcode.ATTACHMENT,
-}
-_TYPES = {kind: record for record, kind in _KINDS.items()}
-
-
-STREAM_KINDS = {MESSAGES: frozenset({int(Opcode.MESSAGE)}), DEFINITIONS: frozenset(_TYPES)}
-"""The kinds of record that a stream has."""
 
 
 class RecordHead(NamedTuple):

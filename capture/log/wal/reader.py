@@ -48,6 +48,10 @@ _FIRST_LOOK = 1 << 12
 _ZEROS = bytes(_PIECE + RECORD_SIZE)
 
 
+MessageKey = tuple[int, int, int]
+"""Channel, sequence number and log time: no two messages of a session share all three."""
+
+
 class WalMessage(NamedTuple):
     """An accepted message.
 
@@ -362,10 +366,6 @@ def recover(folder: Path | str) -> Recovery:
         LogError: If the folder can't be listed.
     """
     return Recovery(Path(folder))
-
-
-MessageKey = tuple[int, int, int]
-"""Channel, sequence number and log time: no two messages of a session share all three."""
 
 
 @dataclass(frozen=True)

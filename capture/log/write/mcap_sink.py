@@ -30,6 +30,10 @@ PROFILE = "ros2"
 """MCAP profile of a log to the contract."""
 
 
+Description: TypeAlias = Schema | Channel | Attachment | Metadata
+"""Definitions, which come before the messages that need them."""
+
+
 def chunk_group(topic: str, type_name: str) -> str:
     """Return the group of a channel: channels of one group share chunks.
 
@@ -37,10 +41,6 @@ def chunk_group(topic: str, type_name: str) -> str:
         type_name: Its message type, e.g. ``sensor_msgs/msg/Imu``.
     """
     return topic if type_name in _BULKY else ""
-
-
-Description: TypeAlias = Schema | Channel | Attachment | Metadata
-"""Definitions, which come before the messages that need them."""
 
 
 class MessageSink(Protocol):

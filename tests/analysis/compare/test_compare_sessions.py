@@ -12,6 +12,8 @@ from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 
+DEGREES = np.degrees(1.0)
+
 SIGMA, EPOCH_NS = 0.003, 1_700_000_000_000_000_000
 
 
@@ -180,7 +182,7 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, com
     assert every.count("<tr") == 1 + len(result.differences)
     shown = {float(v) for v in re.findall(r'<data value="([^"]+)"', every)}
     for difference in result.differences:
-        factor = {"gain": 100.0, "lag": np.degrees(1.0)}.get(
+        factor = {"gain": 100.0, "lag": DEGREES, "offset": DEGREES}.get(
             difference.quantity, 100.0 / difference.a
         )
         for value in (difference.difference.value, *difference.difference.ci95):

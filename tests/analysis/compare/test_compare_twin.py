@@ -48,7 +48,7 @@ def test_the_weak_servo_is_named_first_with_what_was_changed(twins):
     result = compared(base, weak)
     assert result.answer.startswith("B differs from A: joint03 most")
     assert result.named[0].name == "joint03"
-    assert result.named[0].size > 2 * max(joint.size for joint in result.named[1:])
+    assert result.named[0].size > 2 * max((joint.size for joint in result.named[1:]), default=0.0)
     (change,) = result.changed
     assert change.name == "scenario.toml: servo_of.joint03.stall_torque"
     assert (change.a, change.b) == (None, "0.2")

@@ -2,6 +2,8 @@
 
 import os
 import struct
+import subprocess
+import sys
 
 import pytest
 
@@ -181,6 +183,25 @@ def test_a_folder_without_locks_is_an_error_and_never_live(tmp_path, monkeypatch
     assert is_live(tmp_path) is (number == 11)
     assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208
     lock.release()
+
+
+def test_whoever_asks_whether_a_log_is_live_refuses_no_recorder(tmp_path):
+    asks = f"""
+from pathlib import Path
+from undulog.capture.log.wal.format import is_live
+folder = Path({str(tmp_path)!r})
+print("asks", flush=True)
+while not (folder / "enough").exists():
+    is_live(folder)
+"""
+    command = [sys.executable, "-c", asks]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "asks\n"
+        try:
+            for _ in range(300):
+                WalLock(tmp_path).release()
+        finally:
+            (tmp_path / "enough").touch()
 
 
 def test_the_lock_of_a_recorder_that_has_just_ended_is_not_taken(tmp_path, monkeypatch):
