@@ -82,6 +82,7 @@ def write_recording(
     """Convert a session.
 
     Args:
+        session: Opened.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         analysis: The session's analysis, for the response bars and the cycles; None leaves them
             out.
@@ -89,6 +90,14 @@ def write_recording(
         named: Modules that tests name, to be marked.
         notes: The caller's notes on the session, a sentence each.
         layout: Makes the blueprint from what the recording holds.
+
+    Returns:
+        The file and what it holds.
+
+    Example::
+
+        with undulog.Session.open("run.mcap") as session:
+            undulog.write_recording(session, Path("run.rrd"))
 
     Raises:
         DataError: If the session holds nothing that can be drawn.

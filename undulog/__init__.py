@@ -161,6 +161,11 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """What the package offers."""
+    return sorted(__all__)
+
+
 def build(arguments: Sequence[str] = ()) -> App:
     """The command with all its commands, none of them imported.
 
@@ -287,6 +292,10 @@ def run(arguments: Sequence[str]) -> int:
 
     Returns:
         The exit code: 0 done, 1 the work failed, 2 wrong usage.
+
+    Example::
+
+        code = undulog.run(["log", "info", "run.mcap"])
     """
     from cyclopts import CycloptsError, UnknownCommandError
 

@@ -37,6 +37,19 @@ def analyse(
 def analyse(session: SessionLike, /, *more: SessionLike, options: Options | None = None) -> Any:
     """Analyse a session, or several as one experiment, as ``undulog analyse`` does.
 
+    Args:
+        session: An open session, or its path or URL.
+        more: Further sessions of the same experiment.
+        options: What is analysed; None for the defaults of the command.
+
+    Returns:
+        All numbers of one session, or of the experiment where there are several.
+
+    Example::
+
+        result = undulog.analyse("run.mcap")
+        gains = [joint.gain.value for joint in result.joints]
+
     Raises:
         InputFileError: If a file can't be read.
         DataError: If a session has no commands or responses, or no samples of them.
@@ -58,6 +71,18 @@ def compare(
     choices: Choices | None = None,
 ) -> Comparison:
     """Compare two sessions, or two groups of runs: B minus A, as ``undulog compare`` does.
+
+    Args:
+        a: A session, open or by its path or URL; or several, runs of one condition.
+        b: Those of the other condition.
+        choices: Options of the comparison; None for the defaults of the command.
+
+    Returns:
+        What differs, with intervals, the largest difference first.
+
+    Example::
+
+        print(undulog.compare("run.mcap", "again.mcap").answer)
 
     Raises:
         InputFileError: If a file can't be read.
@@ -88,11 +113,20 @@ def record(
 
     Args:
         scenario: A scenario, the name of a shipped one, or a TOML file.
+        path: Of the session, an MCAP file.
         changes: Keys of the scenario file, with dots, to the values that they are to have instead;
             not for a scenario that is read already.
         duration_s: Length of the run instead of the scenario's [s].
         seed: Of the noise, instead of the scenario's.
         force: Replace the file if it is there.
+
+    Returns:
+        Where the session is, and what the twin knows of it: energies, motion of the body.
+
+    Example::
+
+        undulog.record("flat", "run.mcap", duration_s=6.0, seed=1)
+        undulog.record("flat", "again.mcap", duration_s=6.0, seed=2)
 
     Raises:
         UsageError: If no scenario has that name, or changes are given for one that is read.

@@ -108,7 +108,12 @@ class ScanReport:
 
 
 class Catalog:
-    """The catalogue of a folder or URL."""
+    """The catalogue of a folder or URL.
+
+    Example::
+
+        catalog = undulog.Catalog(".")
+    """
 
     def __init__(self, where: Path | str) -> None:
         """Connect; nothing is read.

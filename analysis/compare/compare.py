@@ -34,6 +34,11 @@ from .words import answer_of, moved_offsets
 class Choices:
     """Options of a comparison.
 
+    Example::
+
+        choices = undulog.Choices(any_gait=True)
+        result = undulog.compare("run.mcap", "again.mcap", choices=choices)
+
     Attributes:
         paired: Run i of B belongs to run i of A, e.g. recorded one after the other.
         any_gait: Compare although the gaits differ.

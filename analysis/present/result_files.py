@@ -89,8 +89,16 @@ def save_tables(result: PresentedResult, folder: Path, *, force: bool) -> list[P
 def load(path: Path | str) -> PresentedResult:
     """Read a result that ``save`` wrote, or ``undulog analyse`` and ``compare`` with ``-o``.
 
+    Args:
+        path: A JSON file.
+
     Returns:
         The result, equal to the one that was written.
+
+    Example::
+
+        undulog.analyse("run.mcap").save("result.json")
+        result = undulog.load("result.json")
 
     Raises:
         InputFileError: If it isn't there or can't be read.

@@ -61,6 +61,11 @@ class SessionFacts:
 class Analysis(PresentedResult):
     """All numbers of one session.
 
+    Example::
+
+        result = undulog.analyse("run.mcap")
+        lags_rad = {joint.name: joint.lag_rad.value for joint in result.joints}
+
     Attributes:
         joints: In chain order, head to tail.
         gaits: Where the gait changes, each with its window; the longest is that of ``gait`` and

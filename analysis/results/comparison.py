@@ -151,6 +151,11 @@ class Waveform:
 class Comparison(PresentedResult):
     """Two sessions, or two groups of them, side by side.
 
+    Example::
+
+        result = undulog.compare("run.mcap", "again.mcap")
+        names = [joint.name for joint in result.named]
+
     Attributes:
         verdict: ``different``, ``same`` (within the margins), ``small`` (different, by less than
             the margins) or ``open``.

@@ -203,6 +203,11 @@ class PooledRuns:
 class Experiment(PresentedResult):
     """All numbers of several sessions.
 
+    Example::
+
+        result = undulog.analyse("run.mcap", "again.mcap")
+        print(result.answer)
+
     Attributes:
         answer: One sentence: boundary or module? Or, of kicks, who follows whom?
         sessions: Each session by itself.

@@ -34,6 +34,11 @@ _AROUND_S = 2.0
 class Options:
     """The user's options.
 
+    Example::
+
+        options = undulog.Options(start_s=1.0, stop_s=5.0)
+        result = undulog.analyse("run.mcap", options=options)
+
     Attributes:
         start_s: Start of what is analysed, from the session's start [s]; None: chosen.
         stop_s: Its end, not included [s]; None: chosen.

@@ -214,6 +214,13 @@ def load_robot(name_or_path: str | Path) -> Robot:
         name_or_path: A name of :func:`robot_names`, or the path of a TOML file; the DBC files that
             it lists lie beside it.
 
+    Returns:
+        The robot.
+
+    Example::
+
+        robot = undulog.load_robot("snake25")
+
     Raises:
         UsageError: If no robot has that name.
         InputFileError: If it is a path, and the file isn't there or can't be read.

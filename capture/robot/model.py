@@ -370,6 +370,11 @@ class Bus:
 class Robot:
     """A chain of links and joints with its sensors and its bus.
 
+    Example::
+
+        robot = undulog.load_robot("snake25")
+        names = [joint.name for joint in robot.joints]
+
     Attributes:
         name: Short name, e.g. ``snake25``.
         clock: Whose clock stamps its samples.

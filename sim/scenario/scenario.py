@@ -188,6 +188,10 @@ def _link_fields(table: StrictTable) -> dict[str, float]:
 class Scenario:
     """One run of the twin, complete.
 
+    Example::
+
+        scenario = undulog.load_scenario("flat").changed(duration_s=2.0)
+
     Attributes:
         robot_name: The robot as the scenario names it.
         robot: The robot, with the scenario's modules.

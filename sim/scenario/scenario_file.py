@@ -123,6 +123,13 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         name_or_path: A name of :func:`scenario_names`, or the path of a TOML file.
         changes: Keys, with dots, to the values that they are to have instead.
 
+    Returns:
+        The scenario.
+
+    Example::
+
+        scenario = undulog.load_scenario("flat", {"gait.horizontal.amplitude": 0.2})
+
     Raises:
         UsageError: If no scenario has that name.
         InputFileError: If it is a path, and the file isn't there or can't be read.

@@ -207,6 +207,11 @@ class Sample(NamedTuple):
 class Twin:
     """One robot in its world; use it in a ``with`` block, and run it with :meth:`samples`.
 
+    Example::
+
+        with undulog.Twin(undulog.load_scenario("flat").changed(duration_s=0.1)) as twin:
+            times_s = [sample.time_s for sample in twin.samples()]
+
     Attributes:
         kernels: What computes the force laws.
         sensed: Sensor samples that arrive by the present tick, there before the gait is asked: a

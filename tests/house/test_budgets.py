@@ -4,6 +4,7 @@ import ast
 
 import pytest
 
+import undulog
 from support.paths import ROOT
 
 PRODUCT = ("capture", "sim", "analysis", "replay", "undulog")
@@ -15,6 +16,7 @@ SOURCES = sorted(
 )
 MODULE_LINES, FUNCTION_LINES = 500, 80
 DEEP, DEEP_SHARE = 4, 0.01
+VERBS, OPTIONS = 45, 330
 KERNELS = {"sim/batch/body.py": "passes over a tree of links, compiled as one loop each"}
 """Modules whose functions are compiled, and may be longer."""
 BLOCKS = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.Match)
@@ -89,3 +91,15 @@ def test_constants_stand_above_the_functions():
                 elif after and names:
                     below.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert below == []
+
+
+def test_the_command_line_stays_small():
+    options = 0
+    for verb in undulog.VERBS:
+        command = undulog.build(verb.split())
+        for word in verb.split():
+            command = command[word]
+        names = (str(argument.name) for argument in command.assemble_argument_collection())
+        options += sum(name.startswith("--") for name in names)
+    assert len(undulog.VERBS) <= VERBS
+    assert 200 < options <= OPTIONS

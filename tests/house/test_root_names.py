@@ -1,7 +1,10 @@
 """The names of ``import undulog``: imported when used, typed, and paths in, results out."""
 
+import inspect
 import os
+import re
 import sys
+import textwrap
 import venv
 import zipfile
 from pathlib import Path
@@ -143,3 +146,21 @@ def test_a_notebook_has_one_thread_of_linear_algebra_while_it_analyses(runs, mon
         assert [library["num_threads"] for library in threadpool_info()] == before
     assert seen
     assert set(seen) == {1}
+
+
+@pytest.mark.slow
+def test_every_name_has_an_example_that_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = ["record", "load_scenario", "load_robot"]  # others read what these make
+    for name in [*first, *sorted(set(undulog.__all__) - {*first})]:
+        value = getattr(undulog, name)
+        documentation = inspect.getdoc(value)
+        if inspect.isfunction(value):
+            assert {"Args:", "Returns:"} <= set(documentation.split()), name
+            arguments = re.findall(r"^    (\w+): ", documentation, re.MULTILINE)
+            assert set(inspect.signature(value).parameters) <= {*arguments}, name
+        example = documentation.partition("Example::\n")[2]
+        lines = re.match(r"(?:(?: {4}.*)?\n|(?: {4}.*)$)*", example)[0]
+        assert lines.strip(), name
+        exec(textwrap.dedent(lines), {"undulog": undulog, "Path": Path})
+    assert dir(undulog) == sorted(undulog.__all__)

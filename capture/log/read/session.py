@@ -68,7 +68,13 @@ def _text(text: str) -> str:
 
 
 class Session(Closing, SessionView):
-    """A recorded session, opened for reading: a view of the whole, which can be closed."""
+    """A recorded session, opened for reading: a view of the whole, which can be closed.
+
+    Example::
+
+        with undulog.Session.open("run.mcap") as session:
+            positions = session.joints("/joint_states", "position")
+    """
 
     def __init__(
         self,

@@ -45,6 +45,12 @@ from .mcap_sink import McapSink, MessageSink, own_version
 class SessionWriter(Closing):
     """Writes one session.
 
+    Example::
+
+        with undulog.SessionWriter("own.mcap", session_id="1", epoch_ns=0) as writer:
+            states = writer.joint_state("/joint_states", ["head", "tail"], unit="rad")
+            states.write(10_000_000, [0.1, -0.1])
+
     A method that opens a channel raises DataError if its topic is open already; the channel may be
     opened at any time.
     """
