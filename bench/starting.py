@@ -1,9 +1,10 @@
-"""Starting: all help, and a small command, against importing NumPy.
+"""Starting: all help, a small command and an analysis, against importing NumPy and SciPy.
 
 ``undulog --help`` and ``undulog COMMAND --help`` may each take twice the processor time of
-``python -c 'import numpy'``, and ``undulog log info`` of a small session three times. Each turn
-runs all of them and the peer, in turn, in processes of their own, after a first turn that fills the
-caches; compiled modules are kept, as an installation has them.
+``python -c 'import numpy'``, and ``undulog log info`` of a small session three times; ``undulog
+analyse`` of 20 s of a snake of 25 joints takes at most five times that of ``import numpy,
+scipy.signal``. Each turn runs all of them and the peer, in turn, in processes of their own, after a
+first turn that fills the caches; compiled modules are kept, as an installation has them.
 
 Run: python bench/starting.py [--runs 5]
 """
@@ -22,7 +23,8 @@ from records import compared, versions
 import undulog
 from undulog.capture import SessionWriter
 
-HELP, INFO = 2.0, 3.0
+HELP, INFO, ANALYSIS = 2.0, 3.0, 5.0
+NUMPY, SCIPY = "import numpy", "import numpy, scipy.signal"
 
 
 def write_session(path: Path) -> None:
@@ -42,21 +44,28 @@ def main() -> int:
         bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": f"{folder}/bytecode"}
         start = partial(command_took, sys.executable, env=os.environ | bytecode)
         write_session(session)
-        commands = {"--help": ["--help"]}
-        commands |= {f"{verb} --help": [*verb.split(), "--help"] for verb in undulog.VERBS}
-        commands["log info, a small session"] = ["log", "info", str(session)]
+        snake = Path(folder) / "snake.mcap"
+        undulog.record("weak-servo-pi3", snake, duration_s=20.0)
+        cases = [("--help", ["--help"], NUMPY, HELP)]
+        cases += [
+            (f"{verb} --help", [*verb.split(), "--help"], NUMPY, HELP) for verb in undulog.VERBS
+        ]
+        cases += [
+            ("log info, a small session", ["log", "info", str(session)], NUMPY, INFO),
+            ("analyse, 20 s of 25 joints", ["analyse", str(snake)], SCIPY, ANALYSIS),
+        ]
         starts = [
             partial(start, *command)
-            for words in commands.values()
-            for command in (("-m", "undulog", *words), ("-c", "import numpy"))
+            for _, words, peer, _ in cases
+            for command in (("-m", "undulog", *words), ("-c", peer))
         ]
         in_turn(1, *starts)  # fills the caches
         took = in_turn(runs, *starts)
     used = [[usage.processor_s for usage in turns] for turns in took]
-    peer = f"import of {versions('numpy')}"
+    peers = {NUMPY: versions("numpy"), SCIPY: versions("numpy", "scipy")}
     good = [
-        compared(f"undulog {name}", mine, theirs, peer, bar=HELP if "--help" in name else INFO)
-        for name, mine, theirs in zip(commands, used[::2], used[1::2], strict=True)
+        compared(f"undulog {name}", mine, theirs, f"import of {peers[peer]}", bar=bar)
+        for (name, _, peer, bar), mine, theirs in zip(cases, used[::2], used[1::2], strict=True)
     ]
     return int(not all(good))
 
