@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Everything that takes long, in parts: ``make nightly``.
 
-Each part is a command, and may take an hour; one that goes on where it was (the campaign, the
-mutants) has as many hours as it needs, one a run. What passed for this commit isn't run again. At
-the end, and after an interrupt, a table says what became of each part. The exit code is 1 unless
-all of them passed. Words on the command line choose parts by name: ``.ci/nightly.py zoo pages``.
+Each part is a command, and may take an hour; one that goes on where it was (the night, the
+campaign, the mutants) has as many hours as it needs, one a run. What passed for this commit isn't
+run again. At the end, and after an interrupt, a table says what became of each part. The exit code
+is 1 unless all of them passed. Words on the command line choose parts by name: ``.ci/nightly.py zoo
+pages``.
 
 Only the standard library is used.
 """
@@ -46,7 +47,11 @@ PARTS = {
     "slow": Part("make slow", "the slow tests of what is promised"),
     "clock": Part("make clock", "the tests of real time"),
     "delays": Part("make delays", "delays planted in the product, for the tests of real time"),
-    "night": Part("make night", "levels of intervals, long runs of the twin, pictures, studies"),
+    "night": Part(
+        "UNDULOG_PASSED=out/nightly/COMMIT/passed.txt make night",
+        "levels of intervals, long runs of the twin, pictures, studies",
+        resumes=True,
+    ),
     "campaign": Part(
         "PYTHONPATH=tests:bench:. .venv/bin/python -m campaign.run -o out/nightly/COMMIT/campaign",
         "50,000 attacks with a new seed",

@@ -21,7 +21,7 @@ EXAMPLES = int(os.environ.get("UNDULOG_EXAMPLES") or 30)
 settings.register_profile("undulog", deadline=None, max_examples=EXAMPLES)  # no test is timed
 settings.load_profile("undulog")
 pytest.register_assert_rewrite("support")
-pytest_plugins = ["support.clock_tests"]
+pytest_plugins = ["support.clock_tests", "support.passed_tests"]
 
 # In the background of a script or under nohup these are ignored, and every process that a test
 # starts would inherit that. A handler is not inherited; this one goes on ignoring SIGHUP here.
