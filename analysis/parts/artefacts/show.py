@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from undulog.capture.common.console import plain
 
-from .result import Artefact
+from .result import KINDS, Artefact
 
 _ABOUT = {
     "sensor": "Artefact of the sensor",
@@ -27,3 +29,34 @@ def artefact_line(artefact: Artefact) -> str:
     where = f"{artefact.quantity} on {artefact.topic}" if artefact.topic else artefact.quantity
     about = f"{plain(artefact.joint)}, {where}: {artefact.flag}{note}"
     return f"{_ABOUT[artefact.about]}: {about}{': ' if times else ''}{times}"
+
+
+def warnings_of(artefacts: Iterable[Artefact]) -> list[str]:
+    """Return a sentence for each kind of artefact, with its joints.
+
+    Gaps of the whole session have none: those that matter are in the joints' flags.
+    """
+    joined: dict[tuple[str, str, str], list[Artefact]] = {}
+    for artefact in artefacts:
+        if artefact.flag != "gaps":
+            key = artefact.flag, artefact.quantity, artefact.topic
+            joined.setdefault(key, []).append(artefact)
+    return [_warning(same) for same in joined.values()]
+
+
+def _warning(same: Sequence[Artefact]) -> str:
+    """Return the sentence for artefacts of one kind on one topic."""
+    first = same[0]
+    where = f"{first.quantity} on {first.topic}" if first.topic else first.quantity
+    nulls = "; gain and lag are null" if first.falsifies("position") else ""
+    meaning = {
+        "sensor": f"an artefact of the sensor, not mechanics{nulls}",
+        "sensor or joint": f"the sensor or the joint itself, see the answer{nulls}",
+        "sensor or limit": "the sensor or a limit of the servo",
+        "record": "an artefact of the record, not mechanics",
+        "limit": "a limit of the robot, not a fault of the sensor",
+    }[first.about]
+    notes = ", ".join(dict.fromkeys(artefact.note for artefact in same if artefact.note))
+    named = f"{first.flag}, {notes}" if notes else first.flag
+    names = ", ".join(artefact.joint for artefact in same)
+    return f"{names}: {where}: values {KINDS[first.flag][1]} ({named}): {meaning}"

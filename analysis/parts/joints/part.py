@@ -10,7 +10,8 @@ from ...common.remarks import Remarks
 from ...response.fitting import GaitFit
 from ...signals.session_signals import Signals
 from ..artefacts.part import ARTEFACTS
-from ..artefacts.result import KINDS, Artefact, flags_by_joint
+from ..artefacts.result import Artefact, flags_by_joint
+from ..artefacts.show import warnings_of
 from ..dead_band.part import DEAD_BAND
 from ..energy.part import ENERGIES
 from ..gait.part import GAIT
@@ -40,28 +41,9 @@ def _joints(signals: Signals, done: Results, remarks: Remarks) -> tuple[JointRes
 def _warn_flags(
     artefacts: Iterable[Artefact], joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn
 ) -> None:
-    """Warn of each kind of artefact with its joints, and of responses lost in noise."""
-    joined: dict[tuple[str, str, str], list[Artefact]] = {}
-    for artefact in artefacts:
-        key = artefact.flag, artefact.quantity, artefact.topic
-        joined.setdefault(key, []).append(artefact)
-    for (flag, quantity, topic), same in joined.items():
-        if flag == "gaps":  # of the whole session; those that matter are in the joints' flags
-            continue
-        about, text = KINDS[flag]
-        where = f"{quantity} on {topic}" if topic else quantity
-        nulls = "; gain and lag are null" if same[0].falsifies("position") else ""
-        meaning = {
-            "sensor": f"an artefact of the sensor, not mechanics{nulls}",
-            "sensor or joint": f"the sensor or the joint itself, see the answer{nulls}",
-            "sensor or limit": "the sensor or a limit of the servo",
-            "record": "an artefact of the record, not mechanics",
-            "limit": "a limit of the robot, not a fault of the sensor",
-        }[about]
-        notes = ", ".join(dict.fromkeys(artefact.note for artefact in same if artefact.note))
-        named = f"{flag}, {notes}" if notes else flag
-        names = ", ".join(artefact.joint for artefact in same)
-        warn(f"{names}: {where}: values {text} ({named}): {meaning}")
+    """Warn of artefacts, and of responses lost in noise."""
+    for sentence in warnings_of(artefacts):
+        warn(sentence)
     if holed := [joint.name for joint in joints if "gaps" in joint.flags]:
         warn(f"{', '.join(holed)}: positions have gaps (an artefact of the record, not mechanics)")
     answered = () if gait is None else gait.all_answered
