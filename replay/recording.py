@@ -82,7 +82,7 @@ def write_recording(
     """Convert a session.
 
     Args:
-        session: Opened.
+        session: An open session, or a view of one.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         analysis: The session's analysis, for the response bars and the cycles; None leaves them
             out.

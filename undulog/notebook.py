@@ -121,7 +121,7 @@ def record(
         force: Replace the file if it is there.
 
     Returns:
-        Where the session is, and what the twin knows of it: energies, motion of the body.
+        Where the session is, its length, and what only the twin knows: energies and contacts.
 
     Example::
 

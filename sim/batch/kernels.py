@@ -70,8 +70,7 @@ SAMPLE_ROWS = 9
 
 _ZERO, _HALF, _ONE, _TINY = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 1e-37)])
 
-
-_digest = hashlib.sha256()
+_SOURCES = [Path(str(module.__file__)).read_bytes() for module in (body, compiled_kernels)]
 
 
 @njit(error_model="numpy")
@@ -364,7 +363,5 @@ def _entry(sources: str) -> Callable[..., None]:
     return run_block
 
 
-for _module in (body, compiled_kernels):
-    _digest.update(Path(str(_module.__file__)).read_bytes())
-run_block = _entry(_digest.hexdigest())
+run_block = _entry(hashlib.sha256(b"".join(_SOURCES)).hexdigest())
 """Run all runs of a block through some control periods: :func:`run_lanes`, on a CPU."""

@@ -39,6 +39,8 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 # Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
 _pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity
+ANGLE, RATE = itemgetter(0), itemgetter(1)
+"""Of one of the engine's states of a joint [rad], [rad/s]."""
 
 
 @contextlib.contextmanager
@@ -57,9 +59,6 @@ def _quiet_stderr() -> Generator[None]:
 
 with _quiet_stderr():
     import pybullet
-
-
-_angle, _rate = itemgetter(0), itemgetter(1)
 
 
 class BulletEngine:
@@ -144,7 +143,7 @@ class BulletEngine:
         state.position[...], state.quaternion[...] = fields[:3], fields[3:7]
         state.velocity[...], state.spin[...] = fields[7:10], fields[10:]
         joints = pybullet.getJointStates(self._body, self._joints, client)
-        state.angle[...], state.rate[...] = list(map(_angle, joints)), list(map(_rate, joints))
+        state.angle[...], state.rate[...] = list(map(ANGLE, joints)), list(map(RATE, joints))
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import struct
-from operator import itemgetter
 
 import numpy as np
 from numba import njit
@@ -25,7 +24,7 @@ from numba import njit
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
-from .bullet import BulletEngine, pybullet
+from .bullet import ANGLE, RATE, BulletEngine, pybullet
 from .engine import BodyStart, BodyState
 
 
@@ -132,9 +131,6 @@ def gather(
     generalised[5] += mz - (x * fy - y * fx)
 
 
-_angle, _rate = itemgetter(0), itemgetter(1)
-
-
 class CompiledBulletEngine(BulletEngine):
     """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
 
@@ -159,7 +155,7 @@ class CompiledBulletEngine(BulletEngine):
         velocity, spin = pybullet.getBaseVelocity(body, client)
         joints = pybullet.getJointStates(body, self._joints, client)
         head = *self._place, *turn, *velocity, *spin
-        self._pack(self._buffer, 0, *head, *map(_angle, joints), *map(_rate, joints))
+        self._pack(self._buffer, 0, *head, *map(ANGLE, joints), *map(RATE, joints))
         spread(self._coordinates, self._half, self._vertical, *state, self._hinges)
         self._position = state.position
         return state

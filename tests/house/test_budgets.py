@@ -84,7 +84,9 @@ def test_constants_stand_above_the_functions():
                 after |= isinstance(node, ast.FunctionDef)
             elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-                names = {target.id for target in targets if isinstance(target, ast.Name)}
+                parts = (part for target in targets for part in ast.walk(target))
+                names = {part.id for part in parts if isinstance(part, ast.Name)}
+                names -= {"__all__", "__getattr__"}
                 used = {name.id for name in ast.walk(node.value) if isinstance(name, ast.Name)}
                 if used & ours:
                     ours |= names

@@ -19,6 +19,7 @@ def broken():
 def test_bad_teardown(broken): pass
 @pytest.mark.parametrize("word", ["a b", "c"])
 def test_words(word): pass
+def test_skipped(): pytest.skip("not now")
 """
 
 
@@ -36,11 +37,15 @@ def test_what_passed_is_left_out_and_what_failed_is_run_again(tmp_path):
 
     code, last = once()
     assert code == 1
-    assert last.startswith("1 failed, 4 passed, 1 error")
+    assert last.startswith("1 failed, 4 passed, 1 skipped, 1 error")
     (tmp_path / "mended").touch()
     code, last = once()
     assert code == 0
-    assert last.startswith("2 passed, 3 deselected")
+    assert last.startswith("2 passed, 1 skipped, 3 deselected")
     code, last = once()
     assert code == 0
+    assert last.startswith("1 skipped, 5 deselected")
+    (tmp_path / "test_some.py").write_text(TESTS.replace("def test_skipped", "def _skipped"))
+    code, last = once()
+    assert code == 0  # nothing is left to run
     assert last.startswith("5 deselected")

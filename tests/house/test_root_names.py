@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import textwrap
+import time
 import venv
 import zipfile
 from pathlib import Path
@@ -162,5 +163,5 @@ def test_every_name_has_an_example_that_runs(tmp_path, monkeypatch):
         example = documentation.partition("Example::\n")[2]
         lines = re.match(r"(?:(?: {4}.*)?\n|(?: {4}.*)$)*", example)[0]
         assert lines.strip(), name
-        exec(textwrap.dedent(lines), {"undulog": undulog, "Path": Path})
+        exec(textwrap.dedent(lines), {"undulog": undulog, "Path": Path, "time": time})
     assert dir(undulog) == sorted(undulog.__all__)

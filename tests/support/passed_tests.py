@@ -1,7 +1,8 @@
 """A long run that goes on where it was: tests that a file lists as passed are left out.
 
-``UNDULOG_PASSED=FILE pytest ...`` writes the name of each test that passes, or skips, to FILE, and
-runs none that is listed there. Several runs may share the file.
+``UNDULOG_PASSED=FILE pytest ...`` writes the name of each test that passes to FILE, and runs none
+that is listed there; one that is skipped or not judged is run again. Several runs may share the
+file.
 """
 
 import os
@@ -39,7 +40,7 @@ def pytest_runtest_protocol(item):
     item.stash[REPORTS] = []
     result = yield
     path = _file()
-    if path is not None and not any(report.failed for report in item.stash[REPORTS]):
+    if path is not None and all(report.passed for report in item.stash[REPORTS]):
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as listed:  # short lines: several processes append whole ones
             listed.write(f"{item.nodeid}\n")

@@ -26,8 +26,7 @@ def artefact_line(artefact: Artefact) -> str:
     more = len(artefact.spans_s) - _SPANS
     times = ", ".join(spans) + (f" and {more} more" if more > 0 else "")
     note = f" ({artefact.note})" if artefact.note else ""
-    where = f"{artefact.quantity} on {artefact.topic}" if artefact.topic else artefact.quantity
-    about = f"{plain(artefact.joint)}, {where}: {artefact.flag}{note}"
+    about = f"{plain(artefact.joint)}, {_quantity(artefact)}: {artefact.flag}{note}"
     return f"{_ABOUT[artefact.about]}: {about}{': ' if times else ''}{times}"
 
 
@@ -47,7 +46,6 @@ def warnings_of(artefacts: Iterable[Artefact]) -> list[str]:
 def _warning(same: Sequence[Artefact]) -> str:
     """Return the sentence for artefacts of one kind on one topic."""
     first = same[0]
-    where = f"{first.quantity} on {first.topic}" if first.topic else first.quantity
     nulls = "; gain and lag are null" if first.falsifies("position") else ""
     meaning = {
         "sensor": f"an artefact of the sensor, not mechanics{nulls}",
@@ -59,4 +57,9 @@ def _warning(same: Sequence[Artefact]) -> str:
     notes = ", ".join(dict.fromkeys(artefact.note for artefact in same if artefact.note))
     named = f"{first.flag}, {notes}" if notes else first.flag
     names = ", ".join(artefact.joint for artefact in same)
-    return f"{names}: {where}: values {KINDS[first.flag][1]} ({named}): {meaning}"
+    return f"{names}: {_quantity(first)}: values {KINDS[first.flag][1]} ({named}): {meaning}"
+
+
+def _quantity(artefact: Artefact) -> str:
+    """Return e.g. ``position on /joint_states``."""
+    return f"{artefact.quantity} on {artefact.topic}" if artefact.topic else artefact.quantity

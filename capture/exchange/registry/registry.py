@@ -36,6 +36,9 @@ _FIRST = (
 WIDE = "wide"
 """What ``--to`` names for a table with a column for each joint and quantity."""
 
+_SURE, _LEAST = 0.5, 0.01
+"""A file of another suffix is of a format that fits it so well at least, and a folder."""
+
 _HEAD = 1 << 16
 """Bytes of a file that are looked at."""
 
@@ -56,10 +59,6 @@ def _listed() -> tuple[Format, ...]:
 
 FORMATS = _listed()
 """The formats of this package."""
-
-
-_SURE, _LEAST = 0.5, 0.01
-"""A file of another suffix is of a format that fits it so well at least, and a folder."""
 
 
 def formats() -> tuple[Format, ...]:

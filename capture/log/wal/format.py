@@ -41,7 +41,7 @@ from ...common.part_files import present_path, remove_opened
 
 LOCK_NAME = "recorder.lock"
 LOCK_TRIES, LOCK_PAUSE_S = 100, 0.001
-"""Attempts at a lock, and the pause between them [s]: that of `is_live` lasts microseconds."""
+"""Attempts at a lock, and the pause between [s]: that of :func:`is_live` lasts microseconds."""
 
 MAGIC = b"\x89UWAL1\r\n"
 MARK = 0xA5
@@ -125,7 +125,7 @@ class WalLock:
 
 
 def _lock(opened: int) -> None:
-    """Take an exclusive lock beside whoever asks `is_live`, which holds a shared one briefly.
+    """Take an exclusive lock beside whoever asks :func:`is_live`, which holds a shared one briefly.
 
     Raises:
         BlockingIOError: If a recorder holds it.

@@ -47,9 +47,11 @@ class SessionWriter(Closing):
 
     Example::
 
-        with undulog.SessionWriter("own.mcap", session_id="1", epoch_ns=0) as writer:
+        start_ns = time.time_ns()
+        with undulog.SessionWriter("own.mcap", session_id="1", epoch_ns=start_ns) as writer:
             states = writer.joint_state("/joint_states", ["head", "tail"], unit="rad")
-            states.write(10_000_000, [0.1, -0.1])
+            states.write(start_ns, [0.1, -0.1])
+            states.write(start_ns + 10_000_000, [0.2, -0.2])
 
     A method that opens a channel raises DataError if its topic is open already; the channel may be
     opened at any time.
